@@ -1,0 +1,113 @@
+"""Rigid poses as 4x4 matrices, and the symmetries of objects.
+
+`T_a_b` maps b-coordinates to a: `p_a = T_a_b @ p_b`. Everything is float64, metres and radians.
+
+Symmetry kinds (`records.SYMMETRIES`), each a group acting on the object frame from the right:
+- none: the identity alone;
+- box: the identity and the three half turns about the object's axes;
+- revolution: every turn about the axis, and the half turns that reverse it (a plain cylinder or ellipsoid).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+def pose(rotation: Array | None = None, translation: Array | tuple[float, float, float] = (0, 0, 0)) -> Array:
+    """(4, 4) pose of a (3, 3) rotation (default: none) and a (3,) translation, m."""
+    T = np.eye(4)
+    if rotation is not None:
+        T[:3, :3] = rotation
+    T[:3, 3] = translation
+    return T
+
+
+def inverse(T: Array) -> Array:
+    """The inverse of rigid poses, (..., 4, 4)."""
+    R_t = np.swapaxes(T[..., :3, :3], -1, -2)
+    out = np.zeros_like(T)
+    out[..., :3, :3] = R_t
+    out[..., :3, 3] = -(R_t @ T[..., :3, 3, None])[..., 0]
+    out[..., 3, 3] = 1
+    return out
+
+
+def transform(T_a_b: Array, points_b: Array) -> Array:
+    """(N, 3) points in frame a from (N, 3) points in frame b."""
+    return points_b @ T_a_b[:3, :3].T + T_a_b[:3, 3]
+
+
+def rotate(T_a_b: Array, vectors_b: Array) -> Array:
+    """(N, 3) directions in frame a from (N, 3) directions in frame b."""
+    return vectors_b @ T_a_b[:3, :3].T
+
+
+def rotation_about(axis: Array | tuple[float, float, float], angle: float) -> Array:
+    """(3, 3) rotation by angle (rad) about an axis of any length but zero (Rodrigues)."""
+    x, y, z = np.asarray(axis, float) / np.linalg.norm(axis)
+    K = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * K @ K
+
+
+def random_rotation(rng: np.random.Generator) -> Array:
+    """(3, 3) rotation, uniform over SO(3) (a normalised Gaussian quaternion)."""
+    w, x, y, z = (q := rng.normal(size=4)) / np.linalg.norm(q)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def angle_between(rotation_a: Array, rotation_b: Array) -> Array:
+    """Smallest angle, rad in [0, pi], that turns one (..., 3, 3) rotation into the other."""
+    # The chordal distance is accurate near zero, where arccos of the trace is not.
+    chord = np.linalg.norm(np.asarray(rotation_a) - np.asarray(rotation_b), axis=(-2, -1))
+    return 2 * np.arcsin(np.clip(chord / (2 * np.sqrt(2)), 0, 1))
+
+
+def nearest_symmetric(T_a_object: Array, T_a_reference: Array, kind: str, axis: Array) -> Array:
+    """The symmetric copy of a pose whose rotation is closest to a reference pose.
+
+    Args:
+        T_a_object: (4, 4) pose to choose a copy of.
+        T_a_reference: (4, 4) pose to come close to.
+        kind: "none", "box" or "revolution".
+        axis: (3,) unit axis of revolution in the object frame; ignored for other kinds.
+
+    Returns:
+        (4, 4) pose T_a_object @ g with g in the symmetry group.
+    """
+    R, R_ref = T_a_object[:3, :3], T_a_reference[:3, :3]
+    if kind == "none":
+        return T_a_object.copy()
+    if kind == "box":
+        signs = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]], float)
+        best = signs[np.argmax(signs @ np.einsum("ij,ij->j", R, R_ref))]
+        return pose(R * best, T_a_object[:3, 3])
+    if kind != "revolution":
+        raise ValueError(f"symmetry kind: got '{kind}', expected none, box or revolution")
+    axis_a, axis_ref = R @ axis, R_ref @ axis
+    if axis_a @ axis_ref < 0:
+        axis_a = -axis_a
+    # Turn the reference by the smallest rotation that brings its axis onto ours.
+    cross, cosine = np.cross(axis_ref, axis_a), axis_ref @ axis_a
+    K = np.array([[0, -cross[2], cross[1]], [cross[2], 0, -cross[0]], [-cross[1], cross[0], 0]])
+    return pose((np.eye(3) + K + K @ K / (1 + cosine)) @ R_ref, T_a_object[:3, 3])
+
+
+def symmetric_distance(T_a: Array, T_b: Array, kind: str, axis: Array) -> tuple[float, float]:
+    """Distance (m) of the origins and smallest angle (rad) of two poses modulo the symmetry."""
+    near = nearest_symmetric(T_a, T_b, kind, axis)
+    return float(np.linalg.norm(near[:3, 3] - T_b[:3, 3])), float(angle_between(near[:3, :3], T_b[:3, :3]))
+
+
+def tilt(T_world_object: Array, kind: str) -> float:
+    """Angle (rad) between the object's z axis and up; either end up counts where the symmetry flips it."""
+    cosine = T_world_object[2, 2]
+    return float(np.arccos(np.clip(abs(cosine) if kind != "none" else cosine, -1, 1)))

@@ -1,0 +1,255 @@
+"""The arrays that flow from stage to stage: names, shapes, units, frames.
+
+This is the one table of the format: `store` writes shards by it, `schemas/shard.schema.json` is made
+from it, and each stage returns one of these records. A field's first dimension says how it is stored:
+
+- "demo": one row per demo, no leading axis in the record (`pose/T_world_container` is (4, 4) here and
+  (D, 4, 4) in a shard);
+- anything else is ragged: the rows of all demos one after another in a shard, and
+  `<group>/offsets (D+1,)` tells where each demo starts.
+
+Codes (small integers) carry their names in `names`. World frame: right-handed, z up, metres. The object
+frame has its origin at the centre of the object's bounding box and its z axis up at a goal.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import Field, dataclass, field, fields
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[Any]
+
+PART_KINDS = ("box", "cylinder", "ellipsoid", "mesh")
+ROLES = ("container", "clutter")
+SYMMETRIES = ("none", "box", "revolution")
+GOAL_KINDS = ("floor", "stack", "gap", "peg", "hole")
+REJECT_REASONS = (
+    "penetrates",  # overlaps the container or clutter by more than placement.max_penetration
+    "unsupported",  # nothing under it
+    "tilted",  # further from upright than the task allows, after settling
+    "moved",  # settled too far from the candidate pose
+    "not_at_rest",  # still moving when settling ended
+    "outside",  # centre not inside the container
+    "shaken_off",  # did not stay when the container was shaken
+    "unreachable",  # the judge's own motion cannot bring it there
+)
+
+
+def array(
+    path: str, dtype: str, dims: tuple[str | int, ...], unit: str, frame: str, description: str, names: tuple[str, ...] = ()
+) -> Any:
+    """A record field that is stored as the array `path` of a shard."""
+    return field(
+        metadata={
+            "path": path,
+            "dtype": dtype,
+            "dims": dims,
+            "unit": unit,
+            "frame": frame,
+            "description": description,
+            "names": names,
+        }
+    )
+
+
+@dataclass(frozen=True)
+class Rejected:
+    """Why a demo (or an attempt at one) came to nothing: data to be counted, not an error."""
+
+    reason: str
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A container with clutter, an object, and every candidate goal: what a task returns. Not stored as such.
+
+    P parts, Q object parts, G candidate goals. Sizes are full extents along the part's own axes: box
+    (x, y, z), cylinder (diameter, diameter, height along z), ellipsoid (three diameters).
+    """
+
+    part_kind: Array  # (P,) u1, index into PART_KINDS
+    part_size: Array  # (P, 3) f8, m
+    T_container_part: Array  # (P, 4, 4) f8
+    part_role: Array  # (P,) u1, index into ROLES
+    object_kind: Array  # (Q,) u1
+    object_size: Array  # (Q, 3) f8, m
+    T_object_part: Array  # (Q, 4, 4) f8
+    T_container_goal: Array  # (G, 4, 4) f8, candidate poses of the object; each free slot once
+    goal_kind: Array  # (G,) u1, index into GOAL_KINDS
+    goal_clearance: Array  # (G,) f8, m, total free play along the tightest horizontal direction
+    opening: Array  # (3,) f8, unit, container frame: out of the container; objects come in against it
+    max_tilt: float  # rad, largest angle from upright that still counts as placed
+    symmetry_kind: int  # index into SYMMETRIES
+    symmetry_axis: Array  # (3,) f8, unit, object frame
+    T_world_container: Array  # (4, 4) f8
+    T_world_object_start: Array  # (4, 4) f8
+    container_instance: int  # i8, digest of the container's and clutter's geometry
+    object_instance: int  # i8, digest of the object's geometry
+
+
+@dataclass(frozen=True)
+class Demo:
+    """A scene whose goals were settled and checked, with one of them demonstrated: what `demonstrate` returns."""
+
+    T_world_container: Array = array("pose/T_world_container", "<f8", ("demo", 4, 4), "m", "world", "pose of the container")
+    T_world_object_start: Array = array(
+        "pose/T_world_object_start", "<f8", ("demo", 4, 4), "m", "world", "pose of the object as observed, before placing"
+    )
+    T_world_object_goal: Array = array(
+        "pose/T_world_object_goal", "<f8", ("demo", 4, 4), "m", "world", "demonstrated goal: one valid goal, chosen uniformly"
+    )
+    goals: Array = array("goals/T_world_object", "<f8", ("goal", 4, 4), "m", "world", "every valid goal, as settled")
+    goal_kind: Array = array("goals/kind", "|u1", ("goal",), "1", "-", "what the goal rests on", GOAL_KINDS)
+    goal_clearance: Array = array(
+        "goals/clearance", "<f8", ("goal",), "m", "-", "total free play along the tightest horizontal direction"
+    )
+    rejected_goals: Array = array(
+        "rejected_goals/T_world_object", "<f8", ("rejected_goal", 4, 4), "m", "world", "candidates that failed, as proposed"
+    )
+    rejected_reason: Array = array(
+        "rejected_goals/reason", "|u1", ("rejected_goal",), "1", "-", "why it failed", REJECT_REASONS
+    )
+    symmetry_kind: Array = array("symmetry/kind", "|u1", ("demo",), "1", "-", "symmetry group of the object", SYMMETRIES)
+    symmetry_axis: Array = array("symmetry/axis", "<f8", ("demo", 3), "1", "object", "axis of revolution")
+    part_kind: Array = array("scene/kind", "|u1", ("part",), "1", "-", "shape of each part", PART_KINDS)
+    part_size: Array = array(
+        "scene/size", "<f8", ("part", 3), "m", "part", "full extents: box x y z, cylinder diameter diameter height, ellipsoid"
+    )
+    T_container_part: Array = array("scene/T_container_part", "<f8", ("part", 4, 4), "m", "container", "pose of each part")
+    part_role: Array = array("scene/role", "|u1", ("part",), "1", "-", "container, or clutter that stands in it", ROLES)
+    opening: Array = array("scene/opening", "<f8", ("demo", 3), "1", "container", "unit vector out of the container's opening")
+    max_tilt: Array = array("scene/max_tilt", "<f8", ("demo",), "rad", "-", "largest tilt that counts as placed")
+    object_kind: Array = array("object_parts/kind", "|u1", ("object_part",), "1", "-", "shape of each part", PART_KINDS)
+    object_size: Array = array("object_parts/size", "<f8", ("object_part", 3), "m", "part", "full extents, as scene/size")
+    T_object_part: Array = array("object_parts/T_object_part", "<f8", ("object_part", 4, 4), "m", "object", "pose of each part")
+    demo: Array = array("meta/demo", "<i8", ("demo",), "1", "-", "index of the demo in the dataset")
+    seed: Array = array("meta/seed", "<i8", ("demo",), "1", "-", "the recipe's seed")
+    container_instance: Array = array("meta/container_instance", "<i8", ("demo",), "1", "-", "digest of container and clutter")
+    object_instance: Array = array("meta/object_instance", "<i8", ("demo",), "1", "-", "digest of the object's geometry")
+    attempts: Array = array("meta/attempts", "<i8", ("demo",), "1", "-", "scenes drawn until this one was accepted")
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """Fused, voxelled clouds as the cameras saw them: what `observe` returns."""
+
+    container_points: Array = array("container/points", "<f4", ("container_point", 3), "m", "world", "observed points")
+    container_normals: Array = array("container/normals", "<f4", ("container_point", 3), "1", "world", "unit, toward sensor")
+    container_view: Array = array("container/view", "|u1", ("container_point",), "1", "-", "camera that saw most of the voxel")
+    object_points: Array = array("object/points", "<f4", ("object_point", 3), "m", "world", "observed points at the start pose")
+    object_normals: Array = array("object/normals", "<f4", ("object_point", 3), "1", "world", "unit, toward sensor")
+    object_view: Array = array("object/view", "|u1", ("object_point",), "1", "-", "camera that saw most of the voxel")
+    camera_K: Array = array("camera/K", "<f8", ("camera", 3, 3), "px", "-", "intrinsics; container cameras first")
+    T_world_camera: Array = array(
+        "camera/T_world_camera",
+        "<f8",
+        ("camera", 4, 4),
+        "m",
+        "world",
+        "believed pose, OpenCV axes: x right, y down, z ahead",
+    )
+
+
+@dataclass(frozen=True)
+class Superpoints:
+    """The partition of both clouds: what `cluster` returns. Superpoint s of a demo is row s of its block."""
+
+    container_superpoint: Array = array(
+        "container/superpoint", "<i4", ("container_point",), "1", "-", "superpoint of each point, counted from 0 in each demo"
+    )
+    object_superpoint: Array = array(
+        "object/superpoint", "<i4", ("object_point",), "1", "-", "superpoint of each point, counted from 0 in each demo"
+    )
+    container_superpoint_points: Array = array(
+        "container_superpoints/points", "<f4", ("container_superpoint", 3), "m", "world", "mean of the points"
+    )
+    container_superpoint_normals: Array = array(
+        "container_superpoints/normals", "<f4", ("container_superpoint", 3), "1", "world", "unit, mean of the normals"
+    )
+    container_superpoint_size: Array = array(
+        "container_superpoints/size", "<i4", ("container_superpoint",), "1", "-", "number of points"
+    )
+    object_superpoint_points: Array = array(
+        "object_superpoints/points", "<f4", ("object_superpoint", 3), "m", "world", "mean of the points, start pose"
+    )
+    object_superpoint_normals: Array = array(
+        "object_superpoints/normals", "<f4", ("object_superpoint", 3), "1", "world", "unit, mean of the normals"
+    )
+    object_superpoint_size: Array = array(
+        "object_superpoints/size", "<i4", ("object_superpoint",), "1", "-", "number of points"
+    )
+
+
+@dataclass(frozen=True)
+class Labels:
+    """What the two networks learn: what `label` returns."""
+
+    affordance: Array = array(
+        "container_superpoints/affordance", "<f4", ("container_superpoint",), "1", "-", "in [-1, 1]: 1 near the placed object"
+    )
+    corr_object: Array = array(
+        "correspondence/object_superpoint", "<i4", ("correspondence",), "1", "-", "superpoint of the object"
+    )
+    corr_container: Array = array(
+        "correspondence/container_superpoint", "<i4", ("correspondence",), "1", "-", "superpoint of the container"
+    )
+    corr_distance: Array = array(
+        "correspondence/distance", "<f4", ("correspondence",), "m", "-", "distance of the two with the object at the goal"
+    )
+
+
+R = TypeVar("R", "Demo", "Cloud", "Superpoints", "Labels")
+Record = Demo | Cloud | Superpoints | Labels
+RECORDS: tuple[type[Record], ...] = (Demo, Cloud, Superpoints, Labels)
+
+
+def columns(*records: type[Record]) -> Iterator[Field[Any]]:
+    """The fields of the given record classes (default: all), that is, the arrays of a shard."""
+    for record in records or RECORDS:
+        yield from fields(record)
+
+
+def is_ragged(column: Field[Any]) -> bool:
+    """Whether the array has a number of rows that differs from demo to demo."""
+    return bool(column.metadata["dims"][0] != "demo")
+
+
+def read_record(record: type[R], sample: dict[str, Array]) -> R:
+    """A record from one demo's arrays by path (as `dapdata.open(...)[i]` gives them)."""
+    return record(**{c.name: sample[c.metadata["path"]] for c in fields(record)})
+
+
+def to_sample(*records: Record) -> dict[str, Array]:
+    """One demo's arrays by path, in the stored dtype; the inverse of `read_record`."""
+    return {
+        c.metadata["path"]: np.asarray(getattr(record, c.name), dtype=c.metadata["dtype"])
+        for record in records
+        for c in fields(record)
+    }
+
+
+@dataclass(frozen=True)
+class Placement:
+    """One candidate that a method proposes for a demo; a failed one has a status other than "ok" and NaN poses."""
+
+    T_world_object: Array  # (4, 4) f8
+    score: float  # larger is better; only the order within a demo matters
+    status: str  # "ok", or why there is no pose
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What the judge saw when it executed one placement."""
+
+    success: bool
+    reason: str  # "ok", or the first criterion that failed
+    T_world_object_end: Array  # (4, 4) f8, where the object came to rest; NaN if it was never released
+    moved: float  # m, from the prediction to the end, modulo symmetry
+    turned: float  # rad, the same
+    push: float  # N, largest pushing force while moving in
+    penetration: float  # m, overlap with container and clutter at the predicted pose
+    gap: float  # m, free height under the object at the predicted pose (0 where it touches or overlaps)

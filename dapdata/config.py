@@ -25,7 +25,7 @@ class SceneConfig(Section):
 
 def key(default: Any, description: str, *, unit: str = "", **limits: Any) -> Any:
     """A recipe key: its default, its sentence, its unit, and limits such as ge, le, gt, lt, min_length."""
-    extra = {"unit": unit} if unit else None
+    extra: Any = {"unit": unit} if unit else None
     return Field(default=default, description=f"{description}{f' [{unit}]' if unit else ''}", json_schema_extra=extra, **limits)
 
 

@@ -10,10 +10,12 @@ Symmetry kinds (`records.SYMMETRIES`), each a group acting on the object frame f
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+Array = NDArray[Any]
 
 
 def pose(rotation: Array | None = None, translation: Array | tuple[float, float, float] = (0, 0, 0)) -> Array:

@@ -39,19 +39,19 @@ def inverse(T: Array) -> Array:
 
 def transform(T_a_b: Array, points_b: Array) -> Array:
     """(N, 3) points in frame a from (N, 3) points in frame b."""
-    return points_b @ T_a_b[:3, :3].T + T_a_b[:3, 3]
+    return np.asarray(points_b @ T_a_b[:3, :3].T + T_a_b[:3, 3])
 
 
 def rotate(T_a_b: Array, vectors_b: Array) -> Array:
     """(N, 3) directions in frame a from (N, 3) directions in frame b."""
-    return vectors_b @ T_a_b[:3, :3].T
+    return np.asarray(vectors_b @ T_a_b[:3, :3].T)
 
 
 def rotation_about(axis: Array | tuple[float, float, float], angle: float) -> Array:
     """(3, 3) rotation by angle (rad) about an axis of any length but zero (Rodrigues)."""
     x, y, z = np.asarray(axis, float) / np.linalg.norm(axis)
     K = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * K @ K
+    return np.asarray(np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * K @ K)
 
 
 def random_rotation(rng: np.random.Generator) -> Array:
@@ -70,7 +70,7 @@ def angle_between(rotation_a: Array, rotation_b: Array) -> Array:
     """Smallest angle, rad in [0, pi], that turns one (..., 3, 3) rotation into the other."""
     # The chordal distance is accurate near zero, where arccos of the trace is not.
     chord = np.linalg.norm(np.asarray(rotation_a) - np.asarray(rotation_b), axis=(-2, -1))
-    return 2 * np.arcsin(np.clip(chord / (2 * np.sqrt(2)), 0, 1))
+    return np.asarray(2 * np.arcsin(np.clip(chord / (2 * np.sqrt(2)), 0, 1)))
 
 
 def nearest_symmetric(T_a_object: Array, T_a_reference: Array, kind: str, axis: Array) -> Array:

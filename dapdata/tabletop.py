@@ -1,0 +1,134 @@
+"""Where the container and the object stand on the table: RPDiff's table, shared by the tasks.
+
+The container stands on an arc around a point of the table and faces it; the object starts beside it. World z = 0 is the
+table top.
+
+Source: RPDiff's scene generation (`object_scene_procgen_demos.py`), with its table lowered from z = 1 to 0.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dapdata import solids
+from dapdata.config import CoordinateRange, DegreesRange, LengthRange, SceneConfig, key
+from dapdata.poses import pose, random_rotation, rotation_about
+from dapdata.records import GOAL_KINDS, SYMMETRIES, Rejected, Scene
+from dapdata.solids import Part
+
+Array = NDArray[Any]
+
+ARC_CENTRE = np.array([0.3, 0.0, 0.0])  # m: the point that containers face
+START_TRIES = 100  # draws of a start pose before the scene is given up
+START_MARGIN = 0.02  # m between the container's footprint and the object's bounding sphere
+HOVER = 0.0005  # m: candidates are this far above what they stand on, and settle onto it
+
+
+class TabletopConfig(SceneConfig):
+    """What all table-top tasks share."""
+
+    yaw_deg: DegreesRange = key((-90.0, 90.0), "where on the arc the container stands; it faces the arc's centre", unit="deg")
+    radius: LengthRange = key((0.45, 0.55), "radius of the arc", unit="m")
+    start: Literal["upright", "any"] = key("upright", "object's start: upright on the table, or any rotation, held above it")
+    start_x: CoordinateRange = key((0.2, 0.65), "start position along world x", unit="m")
+    start_y: CoordinateRange = key((-0.6, 0.6), "start position along world y", unit="m")
+    start_height: float = key(0.2, "height above the table of a start in any rotation", unit="m", ge=0.05, le=2)
+    max_tilt_deg: float = key(15.0, "largest angle from upright that counts as placed", unit="deg", gt=0, le=180)
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A place in the container where the object might stand."""
+
+    position: tuple[float, float, float]  # m, container frame, of the object's centre; its axes are the container's
+    kind: str  # one of records.GOAL_KINDS
+    clearance: float  # m, total free play along the tightest horizontal direction
+
+
+def build_scene(
+    params: TabletopConfig,
+    parts: Sequence[Part],
+    object_parts: Sequence[Part],
+    candidates: Sequence[Candidate],
+    symmetry: str,
+    rng: np.random.Generator,
+) -> Scene | Rejected:
+    """The scene of a container that opens along its +x, with container and object put on the table.
+
+    Args:
+        params: The task's parameters.
+        parts: Container and clutter, container frame.
+        object_parts: The object, in its own frame: origin at its bounding box's centre, z up at a goal.
+        candidates: Every place where the object might stand; none makes the scene Rejected("no_free_slot").
+        symmetry: One of records.SYMMETRIES; an axis of revolution is z.
+        rng: Draws the poses.
+    """
+    if not candidates:
+        return Rejected("no_free_slot")
+    kind, size, T, role = solids.collect(parts)
+    object_kind, object_size, T_object_part, _ = solids.collect(object_parts)
+    T_world_container = _container_pose(params, rng)
+    footprint = solids.bounds(kind, size, T)[role == solids.CONTAINER][:, :, :2]
+    extent = solids.bounds(object_kind, object_size, T_object_part)
+    half = np.maximum(-extent[:, 0].min(axis=0), extent[:, 1].max(axis=0))
+    start = _start_pose(params, half, T_world_container, footprint, rng)
+    if start is None:
+        return Rejected("no_room_for_start")
+    return Scene(
+        part_kind=kind,
+        part_size=size,
+        T_container_part=T,
+        part_role=role,
+        object_kind=object_kind,
+        object_size=object_size,
+        T_object_part=T_object_part,
+        T_container_goal=np.stack([pose(None, candidate.position) for candidate in candidates]),
+        goal_kind=np.array([GOAL_KINDS.index(candidate.kind) for candidate in candidates], np.uint8),
+        goal_clearance=np.array([candidate.clearance for candidate in candidates]),
+        opening=np.array([1.0, 0.0, 0.0]),
+        max_tilt=float(np.radians(params.max_tilt_deg)),
+        symmetry_kind=SYMMETRIES.index(symmetry),
+        symmetry_axis=np.array([0.0, 0.0, 1.0]),
+        T_world_container=T_world_container,
+        T_world_object_start=start,
+        container_instance=solids.digest(kind, size, T),
+        object_instance=solids.digest(object_kind, object_size, T_object_part),
+    )
+
+
+def _container_pose(params: TabletopConfig, rng: np.random.Generator) -> Array:
+    """T_world_container on the arc, turned so that its +x looks at the arc's centre."""
+    angle, radius = np.radians(rng.uniform(*params.yaw_deg)), rng.uniform(*params.radius)
+    position = ARC_CENTRE + radius * np.array([np.cos(angle), np.sin(angle), 0])
+    return pose(rotation_about((0, 0, 1), angle + np.pi), position)
+
+
+def _start_pose(
+    params: TabletopConfig, half: Array, T_world_container: Array, footprint: Array, rng: np.random.Generator
+) -> Array | None:
+    """T_world_object_start beside the container, or None if no draw was.
+
+    Args:
+        params: Ranges of the position.
+        half: (3,) half extents of the object, m.
+        T_world_container: (4, 4) pose of the container.
+        footprint: (P, 2, 2) low and high corner in plan of the container's parts, container frame, m.
+        rng: Draws the pose.
+    """
+    low, high = footprint[:, 0].min(axis=0), footprint[:, 1].max(axis=0)
+    is_upright = params.start == "upright"
+    reach = float(np.linalg.norm(half[:2] if is_upright else half)) + START_MARGIN
+    for _ in range(START_TRIES):
+        position = np.array(
+            [rng.uniform(*params.start_x), rng.uniform(*params.start_y), half[2] if is_upright else params.start_height]
+        )
+        in_plan = ((position - T_world_container[:3, 3]) @ T_world_container[:3, :3])[:2]
+        if np.linalg.norm(in_plan - np.clip(in_plan, low, high)) >= reach:
+            rotation = rotation_about((0, 0, 1), rng.uniform(-np.pi, np.pi)) if is_upright else random_rotation(rng)
+            return pose(rotation, position)
+    return None

@@ -6,9 +6,9 @@ range and a sentence. Each stage's section stands above the stage that uses it; 
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 
 class Section(BaseModel):
@@ -29,6 +29,36 @@ def key(default: Any, description: str, *, unit: str = "", **limits: Any) -> Any
     return Field(default=default, description=f"{description}{f' [{unit}]' if unit else ''}", json_schema_extra=extra, **limits)
 
 
+Number = TypeVar("Number", int, float)
+
+
+def _pair(value: Any) -> Any:
+    """YAML and JSON know lists only."""
+    return tuple(value) if isinstance(value, list) else value
+
+
+def _ordered(ends: tuple[Number, Number]) -> tuple[Number, Number]:
+    """The two ends, or an error if the first is the larger one."""
+    if ends[0] > ends[1]:
+        raise ValueError(f"got [{ends[0]}, {ends[1]}], expected [lowest, highest]")
+    return ends
+
+
+# Ranges [lowest, highest] that a value is drawn from, both ends included.
+_Length = Annotated[float, Field(ge=0, le=10)]
+_Factor = Annotated[float, Field(ge=0, le=10)]
+_Share = Annotated[float, Field(ge=0, le=1)]
+_Signed = Annotated[float, Field(ge=-10, le=10)]
+_Count = Annotated[int, Field(ge=0, le=1000)]
+_Degrees = Annotated[float, Field(ge=-180, le=180)]
+LengthRange = Annotated[tuple[_Length, _Length], BeforeValidator(_pair), AfterValidator(_ordered)]
+FactorRange = Annotated[tuple[_Factor, _Factor], BeforeValidator(_pair), AfterValidator(_ordered)]
+ShareRange = Annotated[tuple[_Share, _Share], BeforeValidator(_pair), AfterValidator(_ordered)]
+CoordinateRange = Annotated[tuple[_Signed, _Signed], BeforeValidator(_pair), AfterValidator(_ordered)]
+CountRange = Annotated[tuple[_Count, _Count], BeforeValidator(_pair), AfterValidator(_ordered)]
+DegreesRange = Annotated[tuple[_Degrees, _Degrees], BeforeValidator(_pair), AfterValidator(_ordered)]
+
+
 class SplitConfig(Section):
     """How demos are shared out; by container and object instance, so that no instance is in two splits."""
 
@@ -36,14 +66,90 @@ class SplitConfig(Section):
     test: float = key(0.1, "share of the demos that are looked at once", ge=0, le=0.5)
 
 
-Preset = Literal["default", "paper"]
+# What `preset: paper` changes: the method as published, on the same networks. A key written in the recipe wins.
+PAPER: dict[str, Any] = {
+    "goals": "demonstrated",
+    "prediction": "eps",
+    "score_radii": [],
+    "object_condition": False,
+    "residual": False,
+    "sample_steps": 100,
+    "refine": False,
+    "ranking": "collision",
+}
 
 
 class TrainConfig(Section):
     """The two networks and how they are trained."""
 
-    preset: Preset = key("default", "`paper`: eps prediction, no refinement, ranking by collision count, as published")
+    preset: Literal["default", "paper"] = key(
+        "default", "`paper`: eps prediction of one goal per demo, no refinement, ranking by collision count, as published"
+    )
     minutes: float = key(30.0, "wall-clock budget of both networks together", unit="min", gt=0, le=100_000)
+    affordance_share: float = key(0.6, "share of the minutes that net 1 gets", gt=0, lt=1)
+    goals: Literal["all", "demonstrated"] = key("all", "`all`: every valid goal is a target, not only the demonstrated one")
+    yaw: Literal["front", "any"] = key(
+        "front", "`front`: containers are turned to face one way, by fitted geometry; `any`: trained at every yaw instead"
+    )
+    yaw_jitter_deg: float = key(3.0, "containers are turned by up to this in training (front only)", unit="deg", ge=0, le=45)
+    mirror: bool = key(True, "net 1 also trains on mirror images of the containers")
+    prediction: Literal["x0", "eps"] = key("x0", "net 1 predicts the clean score (cross-entropy) or the noise (squared error)")
+    score_radii: list[float] = key(
+        [0.04, 0.08, 0.14], "net 1 also sees the noisy score smoothed over these radii", unit="m", max_length=8
+    )
+    object_condition: bool = key(True, "net 1 sees the object's extents, an extension of the paper's p(score | container)")
+    diffusion_steps: int = key(100, "T, steps of the diffusion", ge=2, le=10_000)
+    sample_steps: int = key(20, "steps of the sampler, at most T", ge=1, le=10_000)
+    width: int = key(64, "channels of net 1's tokens", ge=8, le=2048)
+    point_width: int = key(48, "channels of net 1's backbone", ge=8, le=2048)
+    pose_width: int = key(48, "channels of net 2", ge=8, le=2048)
+    layers: int = key(2, "Point-DiT blocks of net 1, attention blocks of net 2", ge=1, le=64)
+    point_layers: int = key(2, "backbone blocks", ge=1, le=64)
+    heads: int = key(2, "attention heads of a Point-DiT block; must divide width", ge=1, le=64)
+    groups: int = key(6, "channel groups of vector attention; must divide point_width and pose_width", ge=1, le=64)
+    neighbours: int = key(16, "points that a point attends to within its cloud", ge=2, le=256)
+    cross_neighbours: int = key(32, "points that a point attends to in the other cloud", ge=2, le=1024)
+    container_points: int = key(4096, "raw points kept of a container", ge=64, le=1_000_000)
+    crop_points: int = key(192, "raw points that net 2 sees around a region", ge=16, le=100_000)
+    object_points: int = key(96, "points that net 2 sees of an object", ge=16, le=100_000)
+    crop_margin: float = key(0.03, "space around the region that is cropped along", unit="m", ge=0, le=1)
+    eps_corr: float = key(
+        0.02, "raw points closer than this to the placed object correspond; finer than label.eps_corr", unit="m", gt=0, le=0.2
+    )
+    residual: bool = key(True, "net 2 also predicts where each object point ends up, an extension of the paper")
+    residual_weight: float = key(1.0, "weight of that prediction's loss", ge=0, le=1000)
+    scenes_per_step: int = key(4, "scenes in a training step of net 1", ge=1, le=4096)
+    levels_per_scene: int = key(4, "noise levels that each of them is trained at, for one encoding", ge=1, le=4096)
+    crops_per_step: int = key(8, "crops in a training step of net 2", ge=1, le=4096)
+    learning_rate: float = key(2e-3, "peak of the cosine schedule", gt=0, le=1)
+    warmup_steps: int = key(50, "steps of linear warm-up", ge=0, le=1_000_000)
+    weight_decay: float = key(0.01, "of AdamW", ge=0, le=10)
+    clip: float = key(1.0, "largest norm of a gradient", gt=0, le=1e6)
+    ema: float = key(0.998, "decay of the averaged weights, which are the ones that are kept", ge=0, lt=1)
+    validate_every: int = key(200, "steps between validations", ge=1, le=10_000_000)
+    refine: bool = key(True, "candidates are refined on the observed cloud")
+    ranking: Literal["full", "collision"] = key(
+        "full", "`full`: collision, swept volume, support; `collision`: container points inside the object's box, as published"
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def fill_preset(cls, values: Any) -> Any:
+        """Keys that are not written take the preset's values."""
+        if isinstance(values, dict) and values.get("preset") == "paper":
+            return {**PAPER, **values}
+        return values
+
+    @model_validator(mode="after")
+    def check_divisors(self) -> TrainConfig:
+        """Channels are shared out evenly among heads and groups."""
+        for divisor, widths in (("heads", ("width",)), ("groups", ("point_width", "pose_width"))):
+            for width in widths:
+                if getattr(self, width) % getattr(self, divisor):
+                    raise ValueError(
+                        f"{divisor}: got {getattr(self, divisor)}, expected a divisor of {width} ({getattr(self, width)})"
+                    )
+        return self
 
 
 class EvalConfig(Section):

@@ -1,0 +1,497 @@
+"""The command line: one function a command, each of which imports what it needs when it runs.
+
+Results go to stdout and nothing else does; progress and logs go to stderr. `run_app` is the one place that turns an
+error into a line and an exit code (the codes stand in errors.py).
+"""
+
+from __future__ import annotations
+
+import errno
+import json
+import logging
+import os
+import signal
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from types import FrameType
+from typing import Annotated, Any, Literal
+
+import typer
+
+from dapdata.console import comparison_text, last, made_text, placements_text, progress, remember, report_text, say, show
+from dapdata.errors import DapdataError, UsageError
+
+CLICK_ERROR: type[Exception] = typer.BadParameter.__mro__[
+    2
+]  # ClickException, base of all complaints about arguments; not exported
+
+Net = Literal["both", "affordance", "pose"]
+Protocol = Literal["strict", "rpdiff"]
+Split = Literal["train", "val", "test"]
+
+
+def _option(*names: str, help: str, default: str = "", **more: Any) -> Any:
+    """An option whose default is said in words, because it is found out when the command runs."""
+    words = f"{help}; default: {default}." if default else f"{help}."
+    return typer.Option(*names, help=words, show_default=False, **more)
+
+
+LastDataset = Annotated[Path | None, typer.Argument(help="Dataset folder; default: the last one written from here.")]
+LastRun = Annotated[Path | None, typer.Argument(help="Run folder; default: the last one written from here.")]
+RecipeFile = Annotated[Path, typer.Argument(help="Recipe, such as recipes/quickstart.yaml.")]
+Out = Annotated[Path | None, _option("--out", help="Dataset folder", default="data/<recipe name>", metavar="DIR")]
+RunFolder = Annotated[Path | None, _option("--run", help="Run folder", default="runs/<dataset name>", metavar="DIR")]
+Demos = Annotated[int | None, _option("--demos", help="Number of demos", default="the recipe's", min=1, metavar="N")]
+Overrides = Annotated[list[str] | None, _option("--set", help="Override of a recipe key; may be repeated", metavar="KEY=VALUE")]
+Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
+DryRun = Annotated[bool, typer.Option("--dry-run", help="Only say what would be done, and why.")]
+Fresh = Annotated[bool, typer.Option("--fresh", help="Delete what is there first, instead of going on.")]
+Workers = Annotated[int, typer.Option("--workers", min=1, help="Processes that work at the same time.")]
+Engine = Annotated[str, typer.Option("--engine", help="Where they work: local, ray or ray://HOST:PORT.")]
+Device = Annotated[str, typer.Option("--device", help="auto, cpu, cuda or cuda:N.")]
+Minutes = Annotated[
+    float | None, _option("--minutes", help="Wall-clock budget of training", default="the recipe's", metavar="M")
+]
+InSplit = Annotated[Split, typer.Option("--split", help="Which demos.")]
+Trials = Annotated[int | None, _option("--trials", help="Demos of the split that are judged", default="the recipe's", min=1)]
+Rules = Annotated[Protocol | None, _option("--protocol", help="Rules of the judge", default="the recipe's")]
+K = Annotated[int | None, _option("-k", "--k", help="Candidates for each demo", default="the recipe's", min=1)]
+JsonFile = Annotated[Path | None, _option("--out", help="File for the result as JSON", metavar="FILE.json")]
+
+app = typer.Typer(
+    add_completion=False,
+    no_args_is_help=True,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+    help="Make demonstrations of placing objects into containers; label them, train on them, judge placements in physics.",
+    epilog="Start with: dapdata run recipes/quickstart.yaml",
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
+)
+
+
+def main() -> None:
+    """Entry point of the `dapdata` command."""
+    sys.exit(run_app(sys.argv[1:]))
+
+
+def run_app(arguments: Sequence[str]) -> int:
+    """Runs one command and returns its exit code; an error becomes one line on stderr."""
+    logging.basicConfig(stream=sys.stderr, level=logging.INFO, format="%(message)s")
+    signal.signal(signal.SIGTERM, _terminate)
+    try:
+        code = app(args=list(arguments), prog_name="dapdata", standalone_mode=False)
+        sys.stdout.flush()
+        return code if isinstance(code, int) else 0
+    except DapdataError as error:
+        return _fail(str(error), error.exit_code)
+    except CLICK_ERROR as error:
+        message = error.format_message().rstrip(".")  # type: ignore[attr-defined]
+        return _fail(f"{message}; see `dapdata {' '.join(arguments[:1])} --help`", 2)
+    except (KeyboardInterrupt, typer.Abort):
+        return _fail("stopped; the same command, run again, goes on where it stopped", 130)
+    except BrokenPipeError:  # whoever reads our output (head, less) has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except OSError as error:
+        return _fail(_refusal(error), 6)
+
+
+def _fail(message: str, code: int) -> int:
+    print(message, file=sys.stderr)
+    return code
+
+
+def _terminate(number: int, frame: FrameType | None) -> None:
+    """SIGTERM ends a command the way Ctrl-C does."""
+    raise KeyboardInterrupt
+
+
+def _refusal(error: OSError) -> str:
+    """One line for what the operating system refused."""
+    place = error.filename or "disk"
+    if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+        return f"{place}: no room left ({error.strerror}), expected more; free some, then run the same command again"
+    return f"{place}: {error.strerror or error}; check the path and its permissions"
+
+
+# Recipes ---------------------------------------------------------------------------------------------------
+
+
+@app.command(epilog="Example: dapdata init can_cabinet --to recipes/mine.yaml")
+def init(
+    task: Annotated[str | None, typer.Argument(help="Name of a task; without it, the tasks are listed.")] = None,
+    to: Annotated[Path | None, _option("--to", help="File to write", default="stdout", metavar="FILE")] = None,
+) -> None:
+    """Write a commented starter recipe, or list the tasks."""
+    from dapdata import tasks
+    from dapdata.recipe import starter, summary
+
+    if task is None:
+        if to is not None:
+            raise UsageError(f"--to {to}: no task was named, expected one of {', '.join(tasks.names())}")
+        width = max(len(name) for name in tasks.names())
+        print("\n".join(f"{name:<{width}}  {summary(name)}" for name in tasks.names()))
+        return
+    text = starter(task)
+    if to is None:
+        print(text, end="")
+        return
+    if to.exists():
+        raise UsageError(f"--to {to}: exists already, expected a new file; delete it or choose another name")
+    to.parent.mkdir(parents=True, exist_ok=True)
+    to.write_text(text, encoding="utf-8")
+    print(to)
+
+
+@app.command(epilog="Example: dapdata schema recipe > recipe.schema.json")
+def schema(
+    kind: Annotated[Literal["recipe", "manifest", "shard", "report"], typer.Argument(help="What is described.")],
+) -> None:
+    """Print the JSON Schema of a recipe, manifest, shard or report."""
+    from dapdata.schemas import schema as make_schema
+
+    print(json.dumps(make_schema(kind), indent=2))
+
+
+# Datasets --------------------------------------------------------------------------------------------------
+
+
+@app.command(epilog="Example: dapdata generate recipes/can_cabinet.yaml --workers 2 --set noise.preset=kinect")
+def generate(
+    recipe: RecipeFile,
+    out: Out = None,
+    demos: Demos = None,
+    workers: Workers = 1,
+    engine: Engine = "local",
+    overrides: Overrides = None,
+    dry_run: DryRun = False,
+    fresh: Fresh = False,
+    as_json: Json = False,
+) -> None:
+    """Draw scenes, settle demonstrations, observe point clouds. Goes on where it stopped."""
+    from dapdata import pipeline
+
+    asked = _recipe(recipe, overrides, demos)
+    with progress("generate", "demo") as advance:
+        made = pipeline.generate(
+            asked, out, workers=workers, engine=engine, fresh=fresh, dry_run=dry_run, progress=None if dry_run else advance
+        )
+    _show_made(made, as_json)
+
+
+@app.command(epilog="Example: dapdata label data/can_cabinet --set label.eps_place=0.02")
+def label(
+    dataset: LastDataset = None,
+    workers: Workers = 1,
+    engine: Engine = "local",
+    overrides: Overrides = None,
+    dry_run: DryRun = False,
+    as_json: Json = False,
+) -> None:
+    """Make superpoints, affordance and correspondence, and the shards. Never simulates again."""
+    from dapdata import pipeline
+
+    folder = last("dataset", dataset)
+    with progress("label", "demo") as advance:
+        made = pipeline.label(
+            folder, overrides or (), workers=workers, engine=engine, dry_run=dry_run, progress=None if dry_run else advance
+        )
+    _show_made(made, as_json)
+
+
+@app.command(epilog="Example: dapdata status data/can_cabinet --json")
+def status(dataset: LastDataset = None, as_json: Json = False) -> None:
+    """Say how far a dataset is. Units done in each stage, whether a command is at work, what it cost."""
+    from dapdata import health
+
+    found = health.status(last("dataset", dataset))
+    show(found.to_dict(), as_json, str(found))
+
+
+@app.command(epilog="Example: dapdata inspect data/can_cabinet --json")
+def inspect(dataset: LastDataset = None, as_json: Json = False) -> None:
+    """Say what is inside. Counts, statistics, splits, rejects by reason."""
+    from dapdata import health
+
+    found = health.inspect(last("dataset", dataset))
+    show(found.to_dict(), as_json, str(found))
+
+
+@app.command(epilog="Example: dapdata verify data/can_cabinet")
+def verify(
+    dataset: LastDataset = None,
+    quick: Annotated[bool, typer.Option("--quick", help="Only compare files with their hashes.")] = False,
+    as_json: Json = False,
+) -> int:
+    """Say whether it is whole. Each file by its hash, each array by its content, splits that share nothing."""
+    from dapdata import health
+
+    folder = last("dataset", dataset)
+    with progress("verify", "unit") as advance:
+        found = health.verify(folder, quick=quick, progress=advance)
+    show(found.to_dict(), as_json, str(found))
+    return 0 if found.ok else 3
+
+
+@app.command(epilog="Example: dapdata gc data/can_cabinet --dry-run")
+def gc(dataset: LastDataset = None, dry_run: DryRun = False, as_json: Json = False) -> None:
+    """Free what no manifest names. Units of earlier settings, what killed processes left."""
+    from dapdata import health
+
+    found = health.gc(last("dataset", dataset), dry_run=dry_run)
+    show(found.to_dict(), as_json, str(found))
+
+
+@app.command("show", epilog="Example: dapdata show data/can_cabinet --out cabinet.html")
+def show_dataset(
+    dataset: LastDataset = None,
+    out: Annotated[Path | None, _option("--out", help="A .png or .html file", default="both, named after the dataset")] = None,
+    demo: Annotated[list[int] | None, _option("--demo", help="Number of a demo to show; may be repeated", min=0)] = None,
+    count: Annotated[int, typer.Option("--count", min=1, max=64, help="How many demos, if none is named.")] = 4,
+    as_json: Json = False,
+) -> None:
+    """Draw a contact sheet (PNG) and a page with a 3-D view (HTML)."""
+    from dapdata.show import contact_sheet, show_html
+
+    folder = last("dataset", dataset)
+    targets = [out] if out is not None else [Path(f"{folder.resolve().name}{suffix}") for suffix in (".png", ".html")]
+    if any(target.suffix not in (".png", ".html") for target in targets):
+        raise UsageError(f"--out {out}: expected a .png or .html file")
+    draw = {".png": contact_sheet, ".html": show_html}
+    written = [str(draw[target.suffix](folder, target, demo, count)) for target in targets]
+    show({"files": written}, as_json, "\n".join(written))
+
+
+# Training and judging --------------------------------------------------------------------------------------
+
+
+@app.command(epilog="Example: dapdata train data/can_cabinet --minutes 10 --set train.preset=paper")
+def train(
+    dataset: LastDataset = None,
+    run: RunFolder = None,
+    net: Annotated[Net, typer.Option("--net", help="Which of the two networks.")] = "both",
+    method: Annotated[Literal["dap", "cap"], typer.Option("--method", help="cap: classification, no diffusion.")] = "dap",
+    minutes: Minutes = None,
+    steps: Annotated[int | None, _option("--steps", help="Optimiser steps of each network", min=1, metavar="N")] = None,
+    device: Device = "auto",
+    overrides: Overrides = None,
+    as_json: Json = False,
+) -> None:
+    """Train on the train split. Goes on where it stopped; keeps the best (held-out) and the last weights."""
+    from dapdata import manifest, recipe
+    from dapdata.errors import require
+
+    require("torch", "train")
+    from daptrain import train as train_networks
+
+    folder = last("dataset", dataset)
+    stray = [override for override in overrides or () if not override.startswith("train.")]
+    if stray:
+        raise UsageError(f"--set {stray[0]}: expected a key of the train section, such as train.minutes=10")
+    about = manifest.read(folder)
+    config = recipe.from_resolved(about.recipe, overrides or (), str(folder / manifest.MANIFEST)).train
+    target = run or Path("runs") / folder.resolve().name
+    train_networks(folder, target, net=net, minutes=minutes, steps=steps, device=device, config=config, method=method)
+    remember(dataset=folder, run=target)
+    show({"run": str(target), "dataset": str(folder)}, as_json, str(target))
+
+
+@app.command("eval", epilog="Example: dapdata eval runs/can_cabinet --trials 50 -k 8")
+def evaluate(
+    run: LastRun = None,
+    data: Annotated[Path | None, _option("--data", help="Dataset folder", default="the run's own", metavar="DATASET")] = None,
+    split: InSplit = "test",
+    trials: Trials = None,
+    protocol: Rules = None,
+    method: Annotated[str, typer.Option("--method", help="dap, cap, oracle, random or heuristic.")] = "dap",
+    k: K = None,
+    device: Device = "auto",
+    workers: Workers = 1,
+    as_json: Json = False,
+) -> None:
+    """Predict on a split, then judge in physics. Writes predictions.npz, report.json, report.html, pictures of failures."""
+    from dapdata.errors import require
+
+    require("torch", "train")
+    from daptrain import evaluate as evaluate_run
+
+    folder = last("run", run)
+    report = evaluate_run(
+        folder, data, split=split, trials=trials, protocol=protocol, method=method, k=k, device=device, workers=workers
+    )
+    remember(run=folder)
+    _show_report(report, as_json)
+
+
+@app.command(epilog="Example: dapdata judge mine.npz --data data/can_cabinet --out mine.json")
+def judge(
+    predictions: Annotated[Path, typer.Argument(help="npz with demo, rank, T_world_object and score.")],
+    data: Annotated[Path, _option("--data", help="Dataset folder", metavar="DATASET")],
+    split: InSplit = "test",
+    trials: Annotated[int | None, _option("--trials", help="Demos of the split that are judged", default="all", min=1)] = None,
+    protocol: Annotated[Protocol, typer.Option("--protocol", help="Rules of the judge.")] = "strict",
+    out: JsonFile = None,
+    workers: Workers = 1,
+    as_json: Json = False,
+) -> None:
+    """Judge anyone's placements, from a file. It sees no model; the method saw no goals."""
+    from dapdata.metrics import judge_file
+
+    report = judge_file(predictions, data, protocol, split=split, trials=trials, workers=workers, progress=say)
+    if out is not None:
+        out.write_text(json.dumps(report, indent=1), encoding="utf-8")
+    _show_report(report, as_json)
+
+
+@app.command(epilog="Example: dapdata compare runs/dap/report.json runs/cap/report.json")
+def compare(
+    a: Annotated[Path, typer.Argument(help="report.json of one method.")],
+    b: Annotated[Path, typer.Argument(help="report.json of another, on the same scenes.")],
+    as_json: Json = False,
+) -> None:
+    """Compare two reports scene by scene. With McNemar's paired test."""
+    from dapdata.report import compare as compare_reports
+
+    found = compare_reports(a, b)
+    show(found, as_json, comparison_text(found))
+
+
+@app.command(epilog="Example: dapdata predict runs/quickstart --container container.ply --object object.ply -k 8")
+def predict(
+    run: Annotated[Path, typer.Argument(help="Run folder.")],
+    container: Annotated[Path, _option("--container", help="Scan with normals (ply, pcd, npz, npy); world frame, z up, m")],
+    thing: Annotated[Path, _option("--object", help="Scan of the object, in the same frame")],
+    k: Annotated[int, typer.Option("-k", "--k", min=1, help="Candidates.")] = 8,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Of the random draws.")] = 0,
+    device: Device = "auto",
+    out: JsonFile = None,
+    as_json: Json = False,
+) -> None:
+    """Rank placements for your own scans. Each is the motion that carries the scanned object to its place."""
+    from dapdata.errors import require
+
+    require("torch", "train")
+    from daptrain import predict as predict_placements
+
+    placements = predict_placements(run, container, thing, k=k, seed=seed, device=device)
+    rows = [
+        {
+            "rank": rank,
+            "status": placement.status,
+            "score": placement.score if placement.status == "ok" else None,
+            "T_world_object": placement.T_world_object.tolist() if placement.status == "ok" else None,
+        }
+        for rank, placement in enumerate(placements)
+    ]
+    found = {"run": str(run), "container": str(container), "object": str(thing), "placements": rows}
+    if out is not None:
+        out.write_text(json.dumps(found, indent=1), encoding="utf-8")
+    show(found, as_json, placements_text(rows))
+
+
+@app.command(epilog="Example: dapdata run recipes/quickstart.yaml")
+def run(
+    recipe: RecipeFile,
+    out: Out = None,
+    run_folder: RunFolder = None,
+    demos: Demos = None,
+    minutes: Minutes = None,
+    trials: Trials = None,
+    k: K = None,
+    workers: Workers = 1,
+    engine: Engine = "local",
+    device: Device = "auto",
+    overrides: Overrides = None,
+    fresh: Fresh = False,
+    as_json: Json = False,
+) -> None:
+    """Generate, label, train and eval. Then say how well it went and where everything is."""
+    from dapdata import pipeline
+    from dapdata.errors import require
+
+    for package, extra in (("pybullet", "sim"), ("numba", "sim"), ("torch", "train")):
+        require(package, extra)  # before the first minute is spent
+    from daptrain import evaluate as evaluate_run
+    from daptrain import train as train_networks
+
+    asked = _recipe(recipe, overrides, demos)
+    with progress("generate", "demo") as advance:
+        dataset = _folder(pipeline.generate(asked, out, workers=workers, engine=engine, fresh=fresh, progress=advance))
+    with progress("label", "demo") as advance:
+        pipeline.label(dataset, workers=workers, engine=engine, progress=advance)
+    remember(dataset=dataset)
+    target = run_folder or Path("runs") / dataset.resolve().name
+    train_networks(dataset, target, minutes=minutes, device=device, config=asked.train)
+    remember(run=target)
+    report = evaluate_run(target, dataset, trials=trials, k=k, device=device, workers=workers)
+    files = {"dataset": dataset, "run": target, "report": target / "report.html"} | _leave_behind(dataset, target)
+    made = {name: str(path) for name, path in files.items()}
+    show({**made, "result": report}, as_json, made_text(report, made))
+
+
+# Around ----------------------------------------------------------------------------------------------------
+
+
+@app.command(epilog="Example: dapdata bench --scale quick")
+def bench(
+    against: Annotated[str | None, _option("--against", help="Only benchmarks that know this rival")] = None,
+    scale: Annotated[Literal["quick", "normal", "long"], typer.Option("--scale", help="How many repetitions.")] = "normal",
+    as_json: Json = False,
+) -> None:
+    """Measure speed, memory and start-up. On this machine, next to named rivals."""
+    from dapdata import bench as benchmarks
+
+    about, rows = benchmarks.machine(), []
+    for row in benchmarks.run(against, scale):
+        say(benchmarks.table([row]).split("\n")[1])
+        rows.append(row)
+    text = "\n".join([*(f"{name}: {value}" for name, value in about.items()), "", benchmarks.table(rows)])
+    show({"machine": about, "rows": rows}, as_json, text)
+
+
+# What several commands do ----------------------------------------------------------------------------------
+
+
+def _recipe(path: Path, overrides: list[str] | None, demos: int | None) -> Any:
+    """The recipe that a command line asks for."""
+    from dapdata.recipe import load
+
+    return load(path, [*(overrides or ()), *([f"demos={demos}"] if demos is not None else [])])
+
+
+def _show_made(made: Any, as_json: bool) -> None:
+    """Shows the dataset's folder, or the plan."""
+    if isinstance(made, Path):
+        remember(dataset=made)
+        show({"dataset": str(made)}, as_json, str(made))
+    else:
+        show(made.to_dict(), as_json, str(made))
+
+
+def _folder(made: Any) -> Path:
+    assert isinstance(made, Path), "only a dry run makes a plan"
+    return made
+
+
+def _show_report(report: dict[str, Any], as_json: bool) -> None:
+    """Shows a report, then raises if its judge is broken."""
+    from dapdata.metrics import require_sound
+    from dapdata.report import Report
+
+    show(report, as_json, report_text(report))
+    require_sound(Report.model_validate_json(json.dumps(report)))
+
+
+def _leave_behind(dataset: Path, run: Path) -> dict[str, Path]:
+    """Pictures of the dataset, and the clouds of one held-out demo as scans to try `dapdata predict` on."""
+    from dapdata.clouds import write_ply
+    from dapdata.loading import open as open_dataset
+    from dapdata.show import contact_sheet, show_html
+
+    sample = open_dataset(dataset, "test")[0]
+    scans = {name: run / f"{name}.ply" for name in ("container", "object")}
+    for name, path in scans.items():
+        write_ply(path, sample[f"{name}/points"], sample[f"{name}/normals"])
+    pictures = {"pictures": contact_sheet(dataset, run / "dataset.png"), "viewer": show_html(dataset, run / "dataset.html")}
+    return {**pictures, **{f"{name} scan": path for name, path in scans.items()}}

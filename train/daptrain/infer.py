@@ -1,0 +1,203 @@
+"""Ranked placements from two raw clouds: superpoints, sampled regions, correspondences, refinement, ranking.
+
+Nothing here sees ground truth. The superpoints are made by `dapdata.cluster`, the one stage that inference shares with
+the data engine: a user's own cloud must be partitioned as the training clouds were.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from dapdata import poses
+from dapdata.cluster import SuperpointsConfig, means, partition
+from dapdata.config import TrainConfig
+from dapdata.errors import CheckpointError, UsageError
+from dapdata.records import Placement
+from daptrain import affordance, pose, refine
+from daptrain.affordance import AffordanceNet
+from daptrain.checkpoint import load_network, read_description
+from daptrain.fit import ObjectFit, fit_object
+from daptrain.loop import pick_device
+from daptrain.pose import PoseNet
+from daptrain.prepare import Crop, Inputs, crop, prepare_inputs, region_reach
+
+Array = NDArray[Any]
+
+SMALLEST_CLOUD = 20  # points: no frame can be fitted to fewer
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """One candidate on its way: its region and the pose that net 2 gave it."""
+
+    score: Array  # (S,) f4 in [-1, 1], sampled
+    T_world_box: Array  # (4, 4) f8, NaN where there is none
+    residual: float  # m, how badly net 2's targets agree with a rigid motion; NaN where there is no pose
+    status: str  # "ok", "no_region", or why Kabsch gave no pose
+
+
+@dataclass(frozen=True)
+class Predictor:
+    """Both networks of a run, ready to place objects."""
+
+    task: str
+    method: Literal["dap", "cap"]
+    config: TrainConfig
+    superpoints: SuperpointsConfig
+    eps_place: float  # m, that the scores were labelled with
+    affordance: AffordanceNet
+    pose: PoseNet
+    device: torch.device
+
+    @classmethod
+    def load(cls, run: str | Path, device: str = "auto", task: str | None = None) -> Predictor:
+        """The networks of a run folder.
+
+        Args:
+            run: Folder that `train` wrote.
+            device: "auto", "cpu", "cuda", ...
+            task: Refuse a run that was trained on another task.
+
+        Raises:
+            CheckpointError: no run, weights of another task or network version, damaged files.
+        """
+        run, where = Path(run), pick_device(device)
+        description = read_description(run)
+        if task is not None and description["task"] != task:
+            raise CheckpointError(
+                f"{run}: was trained on task {description['task']}, the data are of task {task}; "
+                "give the run of this task, or train one"
+            )
+        try:
+            config = TrainConfig.model_validate(description["train"])
+            superpoints = SuperpointsConfig.model_validate(description["recipe"]["superpoints"])
+            eps_place = float(description["recipe"]["label"]["eps_place"])
+        except (KeyError, TypeError, ValueError) as error:
+            raise CheckpointError(f"{run}/config.json: {str(error).splitlines()[0]}; train again with this version") from error
+        networks = [load_network(run, name, description, config, where) for name in ("affordance", "pose")]
+        first, second = networks
+        assert isinstance(first, AffordanceNet)
+        assert isinstance(second, PoseNet)
+        return cls(description["task"], description["method"], config, superpoints, eps_place, first, second, where)
+
+    def predict(
+        self,
+        container_points: Array,
+        container_normals: Array,
+        object_points: Array,
+        object_normals: Array,
+        k: int,
+        rng: np.random.Generator,
+        *,
+        T_world_object: Array | None = None,
+    ) -> list[Placement]:
+        """k placements, best first; those that failed come last, with their status.
+
+        Args:
+            container_points: (N, 3) observed points of the container and what stands in it, world frame, z up, m.
+            container_normals: (N, 3) unit, towards the sensor.
+            object_points: (M, 3) observed points of the object where it is now, world frame, m.
+            object_normals: (M, 3).
+            k: How many candidates are drawn.
+            T_world_object: (4, 4) the object's pose now, in whichever frame the caller gives it. Default: the world's
+                frame itself, so that a placement is the motion that carries the observed object to its place.
+
+        Raises:
+            UsageError: clouds that are too small, not finite, or whose points and normals do not match.
+        """
+        for name, points, normals in (
+            ("container", container_points, container_normals),
+            ("object", object_points, object_normals),
+        ):
+            check_cloud(name, points, normals)
+        inputs = self.prepare(container_points, container_normals, object_points, object_normals, rng)
+        proposals = self.propose(inputs, k, rng)
+        T_world_box, scores = self.finish(proposals, container_points, container_normals, object_points, object_normals)
+        motion = T_world_box @ poses.inverse(inputs.T_world_box)
+        start = np.eye(4) if T_world_object is None else T_world_object
+        placements = [
+            Placement(motion[i] @ start, float(scores[i]), "ok")
+            if p.status == "ok"
+            else Placement(np.full((4, 4), np.nan), -np.inf, p.status)
+            for i, p in enumerate(proposals)
+        ]
+        return sorted(placements, key=lambda placement: -placement.score)
+
+    def prepare(
+        self,
+        container_points: Array,
+        container_normals: Array,
+        object_points: Array,
+        object_normals: Array,
+        rng: np.random.Generator,
+    ) -> Inputs:
+        """The clouds as the networks see them."""
+        label = partition(container_points, container_normals, self.superpoints.count, self.superpoints)
+        centres, normals, _ = means(container_points, container_normals, label)
+        clouds = (container_points, container_normals, label, centres, normals, object_points, object_normals)
+        return prepare_inputs(*clouds, self.config, rng)
+
+    def propose(self, inputs: Inputs, k: int, rng: np.random.Generator) -> list[Proposal]:
+        """k candidates, unrefined, in the order drawn: all regions at once, then all poses at once."""
+        scores = self.regions(inputs, k, rng)
+        crops = [crop(inputs, score, self.eps_place, self.config.crop_margin, self.config, rng) for score in scores]
+        found = [i for i, piece in enumerate(crops) if piece is not None]
+        proposals = [Proposal(score, np.full((4, 4), np.nan), np.nan, "no_region") for score in scores]
+        if found:
+            pieces = [piece for piece in crops if piece is not None]
+            batch = pose.collate(pieces, np.repeat(inputs.extents[None], len(pieces), axis=0), self.device)
+            solved = pose.solve(self.pose, batch)
+            for i, piece, solution in zip(found, pieces, solved):
+                proposals[i] = replace(
+                    proposals[i],
+                    T_world_box=inputs.T_world_front @ poses.pose(translation=piece.centre) @ solution.T_crop_box,
+                    residual=solution.residual,
+                    status=solution.status,
+                )
+        return proposals
+
+    def regions(self, inputs: Inputs, k: int, rng: np.random.Generator) -> list[Array]:
+        """k scores (S,) in [-1, 1]: samples of net 1, or with `cap` the k best peaks of its one classification."""
+        batch = affordance.collate([inputs], np.zeros(1), np.zeros(1, bool), self.device)
+        if self.method == "dap":
+            return list(affordance.sample(self.affordance, batch, k, self.config.sample_steps, rng)[0])
+        score = affordance.sample(self.affordance, batch, 1, 1, rng)[0, 0]
+        found = affordance.peaks(score, inputs.superpoints, k, region_reach(inputs.extents, self.eps_place))
+        return found + [np.full_like(score, -1.0)] * (k - len(found))
+
+    def finish(
+        self,
+        proposals: list[Proposal],
+        container_points: Array,
+        container_normals: Array,
+        object_points: Array,
+        object_normals: Array,
+    ) -> tuple[Array, Array]:
+        """(K, 4, 4) T_world_box and (K,) scores after refinement and ranking, as the config says."""
+        T_world_box = np.stack([p.T_world_box for p in proposals])
+        box: ObjectFit = fit_object(object_points, object_normals)
+        if self.config.ranking == "collision" and not self.config.refine:
+            return T_world_box, refine.rank_collision_count(T_world_box, container_points, box)
+        scene = refine.observed_scene(container_points, container_normals)
+        if self.config.refine:
+            T_world_box = refine.refine(T_world_box, scene, box)
+        if self.config.ranking == "collision":
+            return T_world_box, refine.rank_collision_count(T_world_box, container_points, box)
+        residual = np.array([p.residual for p in proposals])
+        return T_world_box, refine.rank(T_world_box, scene, box, residual)
+
+
+def check_cloud(name: str, points: Array, normals: Array) -> None:
+    """Refuses a cloud that nothing can be fitted to."""
+    if points.ndim != 2 or points.shape[1:] != (3,) or normals.shape != points.shape:
+        raise UsageError(f"{name} cloud: got points {points.shape} and normals {normals.shape}, expected both (N, 3)")
+    if len(points) < SMALLEST_CLOUD:
+        raise UsageError(f"{name} cloud: got {len(points)} points, expected at least {SMALLEST_CLOUD}; is it in sight?")
+    if not (np.isfinite(points).all() and np.isfinite(normals).all()):
+        raise UsageError(f"{name} cloud: has NaN or infinite numbers, expected finite metres; remove those points")

@@ -1,0 +1,363 @@
+"""Units on disk: the only door to zarr.
+
+A unit is one Zarr v3 group that holds some demos: the columns of `records` as concatenated rows, an `offsets`
+array for each ragged group, and in the root's attributes under `dapdata` the unit's own record: key, demos,
+rejects, and the sha256 of every other file. The manifest names the hash of the root's `zarr.json`, which thereby
+covers the unit. (A `unit.json` beside it would make zarr warn every stranger who lists the group.)
+
+Codecs: sharding, zstd, and crc32c last, so that plain zarr refuses a flipped chunk too. One file an array.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import Field, dataclass, field
+from hashlib import sha256
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dapdata import durable
+from dapdata.errors import CorruptionError
+from dapdata.records import Array, Record, columns, is_ragged
+
+FORMAT = 1
+MAX_CHUNK_ROWS = 32768  # fewer rows in a chunk make reading and writing slower, more make nothing faster
+ZSTD_LEVEL = 1  # observed coordinates are noise: level 3 is no smaller
+TOLERANCE = 1e-3  # of stored float32 normals
+RIGID_TOLERANCE = 1e-6  # of float64 poses
+
+Sample = dict[str, Array]  # one demo's arrays by path, without offsets
+RecordType = type[Record]
+
+INDEX_INTO = {  # codes that count rows of another group of the same demo
+    "container/superpoint": "container_superpoints",
+    "object/superpoint": "object_superpoints",
+    "correspondence/container_superpoint": "container_superpoints",
+    "correspondence/object_superpoint": "object_superpoints",
+}
+
+
+@dataclass(frozen=True)
+class Block:
+    """Some demos of a unit, decoded: columns of concatenated rows, and where each demo's rows begin."""
+
+    arrays: Mapping[str, Array]  # by path, offsets included
+    demos: int
+
+    def sample(self, row: int) -> Sample:
+        """The arrays of one demo by path: views, not copies."""
+        return {
+            path: np.asarray(array[self._rows(path, row)])
+            for path, array in self.arrays.items()
+            if not path.endswith("/offsets")
+        }
+
+    def _rows(self, path: str, row: int) -> Any:
+        if not is_ragged(COLUMNS[path]):
+            return row
+        offsets = self.arrays[offsets_path(path)]
+        return slice(int(offsets[row]), int(offsets[row + 1]))
+
+
+COLUMNS: dict[str, Field[Any]] = {column.metadata["path"]: column for column in columns()}
+
+
+def offsets_path(path: str) -> str:
+    """Where the offsets of a ragged column are: one array for each group."""
+    return f"{path.split('/')[0]}/offsets"
+
+
+def group_columns(*records: RecordType) -> dict[str, list[Field[Any]]]:
+    """The columns of some record classes by group: {"container": [points, normals, ...], ...}."""
+    groups: dict[str, list[Field[Any]]] = {}
+    for column in columns(*records):
+        groups.setdefault(column.metadata["path"].split("/")[0], []).append(column)
+    return groups
+
+
+# Digests and checks ----------------------------------------------------------------------------------------
+
+
+def demo_digest(sample: Sample) -> str:
+    """sha256 over one demo's decoded arrays: path, dtype, shape and little-endian bytes, in the order of their paths."""
+    total = sha256()
+    for path in sorted(sample):
+        array = np.ascontiguousarray(sample[path], dtype=COLUMNS[path].metadata["dtype"])
+        total.update(f"{path} {array.dtype.str} {list(array.shape)}\n".encode())
+        total.update(array.data)
+    return total.hexdigest()
+
+
+def content_digest(digests: Sequence[str]) -> str:
+    """sha256 over the demos' digests in demo order: the same whatever the workers, the shards and the codecs."""
+    return sha256("\n".join(digests).encode()).hexdigest()
+
+
+def problems(sample: Sample) -> Iterator[str]:
+    """What is wrong with one demo's arrays, each as "path: found, expected"; nothing if it may be stored."""
+    rows: dict[str, int] = {}
+    for path, array in sample.items():
+        about = COLUMNS[path].metadata
+        fixed = about["dims"][1:]
+        ragged = is_ragged(COLUMNS[path])
+        if array.shape[1 if ragged else 0 :] != fixed or array.ndim != len(fixed) + ragged:
+            yield f"{path}: shape {array.shape}, expected {about['dims'][0 if ragged else 1 :]}"
+            return
+        if ragged:
+            group = path.split("/")[0]
+            if rows.setdefault(group, len(array)) != len(array):
+                yield f"{path}: {len(array)} rows, expected {rows[group]} as in the rest of {group}"
+        yield from _value_problems(path, array, about)
+    for path, target in INDEX_INTO.items():
+        if path in sample and target in rows and sample[path].size:
+            low, high = int(sample[path].min()), int(sample[path].max())
+            if low < 0 or high >= rows[target]:
+                yield f"{path}: {low} to {high}, expected rows of {target}, 0 to {rows[target] - 1}"
+
+
+def _value_problems(path: str, array: Array, about: Mapping[str, Any]) -> Iterator[str]:
+    name = path.split("/")[1]
+    if array.size == 0:
+        return
+    if array.dtype.kind == "f" and not np.isfinite(array).all():
+        yield f"{path}: {int((~np.isfinite(array)).sum())} values are not finite"
+    elif name == "normals" and np.abs(np.einsum("ni,ni->n", array, array) - 1).max() > 2 * TOLERANCE:
+        yield f"{path}: not unit vectors"
+    elif about["dims"][-2:] == (4, 4) and not is_rigid(array):
+        yield f"{path}: not rigid transforms"
+    elif about["names"] and int(array.max()) >= len(about["names"]):
+        yield f"{path}: code {int(array.max())}, expected below {len(about['names'])}"
+    elif name == "affordance" and np.abs(array).max() > 1:
+        yield f"{path}: {float(array.min())} to {float(array.max())}, expected -1 to 1"
+
+
+def is_rigid(transforms: Array) -> bool:
+    """Whether all of (..., 4, 4) are rotations with translations: orthogonal, right-handed, last row 0 0 0 1."""
+    rotation = transforms[..., :3, :3]
+    square = rotation @ np.swapaxes(rotation, -1, -2)
+    return bool(
+        np.abs(square - np.eye(3)).max() <= RIGID_TOLERANCE
+        and (np.linalg.det(rotation) > 0).all()
+        and (transforms[..., 3, :] == (0, 0, 0, 1)).all()
+    )
+
+
+# Writing ---------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Lender:
+    """A committed unit with the same demos: its files are linked instead of being encoded and stored twice."""
+
+    folder: Path
+    files: Mapping[str, Mapping[str, Any]]
+    paths: frozenset[str] = field(default_factory=frozenset)  # arrays that it holds, offsets included
+
+
+def write_unit(
+    folder: Path,
+    records: Sequence[RecordType],
+    samples: Sequence[Sample],
+    about: Mapping[str, Any],
+    lenders: Sequence[Lender] = (),
+) -> dict[str, Any]:
+    """Writes a unit into an empty folder; `durable.commit` then moves it to its place.
+
+    Args:
+        folder: Where; must be staged.
+        records: Record classes whose columns are written.
+        samples: One a demo, in demo order; may be empty.
+        about: The unit's record; `files` is added here.
+        lenders: Committed units that hold some of the columns for exactly these demos.
+
+    Returns:
+        The unit's record as stored.
+    """
+    import zarr
+
+    group = zarr.open_group(folder, mode="a", zarr_format=3)
+    files: dict[str, dict[str, Any]] = {}
+    for name, members in group_columns(*records).items():
+        subgroup = group.create_group(name)
+        for path, array in _columns_of_group(name, members, samples):
+            lender = next((lender for lender in lenders if path in lender.paths), None)
+            if lender:
+                files |= _borrow(folder, path, lender)
+            else:
+                _write_array(subgroup, path, array() if callable(array) else array)
+    files |= {path: fact for path, fact in _hash_all(folder).items() if path not in files}
+    record = {**about, "files": dict(sorted(files.items()))}
+    group.attrs["dapdata"] = record
+    return record
+
+
+def _columns_of_group(name: str, members: list[Field[Any]], samples: Sequence[Sample]) -> Iterator[tuple[str, Any]]:
+    """(path, array or function that makes it) of a group; a function, so that one column is in memory at a time."""
+    ragged = next((column for column in members if is_ragged(column)), None)
+    if ragged is not None:
+        lengths = [len(sample[ragged.metadata["path"]]) for sample in samples]
+        yield f"{name}/offsets", np.concatenate([[0], np.cumsum(lengths, dtype=np.int64)]).astype(np.int64)
+    for column in members:
+        yield column.metadata["path"], lambda column=column: _concatenated(column, samples)
+
+
+def _concatenated(column: Field[Any], samples: Sequence[Sample]) -> Array:
+    about = column.metadata
+    parts = [sample[about["path"]] for sample in samples]
+    if not parts:
+        return np.zeros((0, *about["dims"][1:]), dtype=about["dtype"])
+    return np.concatenate(parts) if is_ragged(column) else np.stack(parts)
+
+
+def _write_array(group: Any, path: str, array: Array) -> None:
+    from zarr.codecs import Crc32cCodec, ZstdCodec
+
+    about = COLUMNS[path].metadata if path in COLUMNS else _offsets_about(path)
+    rows = max(len(array), 1)
+    chunk = min(rows, MAX_CHUNK_ROWS)
+    target = group.create_array(
+        path.split("/")[1],
+        shape=array.shape,
+        dtype=array.dtype,
+        chunks=(chunk, *array.shape[1:]),
+        shards=(-(-rows // chunk) * chunk, *array.shape[1:]),
+        compressors=[ZstdCodec(level=ZSTD_LEVEL), Crc32cCodec()],
+        fill_value={"f": np.nan, "i": -1, "u": np.iinfo(np.uint8).max}[array.dtype.kind],
+        dimension_names=[about["dims"][0], *_axis_names(about["dims"][1:])],
+        attributes={key: about[key] for key in ("unit", "frame", "description")} | _named_codes(about),
+        config={"write_empty_chunks": True},
+    )
+    if len(array):
+        target[...] = array
+
+
+def _offsets_about(path: str) -> dict[str, Any]:
+    description = "rows offsets[d] to offsets[d + 1] of this group are demo d's"
+    return {"dims": ("demo_edge",), "unit": "1", "frame": "-", "description": description, "names": ()}
+
+
+def _named_codes(about: Mapping[str, Any]) -> dict[str, Any]:
+    return {"names": list(about["names"])} if about["names"] else {}
+
+
+def _axis_names(dims: tuple[Any, ...]) -> list[str]:
+    """(3,) is "xyz"; matrices have a row and a column."""
+    return ["xyz"] if len(dims) == 1 else ["row", "column"][: len(dims)]
+
+
+def _borrow(folder: Path, path: str, lender: Lender) -> dict[str, dict[str, Any]]:
+    """Links an array's files from a committed unit (copies them where the file system has no links); their facts."""
+    facts = {name: dict(fact) for name, fact in lender.files.items() if name.startswith(f"{path}/")}
+    for name in facts:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        try:
+            os.link(lender.folder / name, folder / name)
+        except OSError:
+            (folder / name).write_bytes((lender.folder / name).read_bytes())
+    return facts
+
+
+def _hash_all(folder: Path) -> dict[str, dict[str, Any]]:
+    """{path: {sha256, bytes}} of every file below, but for the root's own zarr.json."""
+    facts = {}
+    for path in sorted(folder.rglob("*")):
+        name = path.relative_to(folder).as_posix()
+        if path.is_file() and name != "zarr.json":
+            facts[name] = {"sha256": durable.hash_file(path), "bytes": path.stat().st_size}
+    return facts
+
+
+def lender(folder: Path, record: Mapping[str, Any]) -> Lender:
+    """A committed unit as a lender of all arrays that it holds."""
+    arrays = {name.removesuffix("/zarr.json") for name in record["files"] if name.count("/") == 2}
+    return Lender(folder, record["files"], frozenset(arrays))
+
+
+# Reading ---------------------------------------------------------------------------------------------------
+
+
+def is_committed(folder: Path) -> bool:
+    """Whether there is a whole unit: committing is a rename, so its root is there or nothing is."""
+    return (folder / "zarr.json").is_file()
+
+
+def read_record(folder: Path) -> dict[str, Any]:
+    """The unit's own record: key, demos, rejects, files.
+
+    Raises:
+        CorruptionError: if the root is missing, is no JSON, or holds no such record.
+    """
+    try:
+        record: dict[str, Any] = json.loads((folder / "zarr.json").read_bytes())["attributes"]["dapdata"]
+        return {**record, "files": dict(record["files"]), "rows": list(record["rows"])}
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise CorruptionError(f"{folder}/zarr.json: cannot be read as a unit ({error}); run `dapdata verify`") from error
+
+
+def damaged_files(folder: Path, record: Mapping[str, Any]) -> Iterator[str]:
+    """What differs between a unit's files and its record, each as "path: what"; nothing if it is whole.
+
+    The root's zarr.json is not covered: whoever names the unit knows its hash.
+    """
+    present = {
+        path.relative_to(folder).as_posix(): path for path in folder.rglob("*") if not path.is_dir() or path.is_symlink()
+    }
+    present.pop("zarr.json", None)
+    for name, fact in record["files"].items():
+        path = present.pop(name, None)
+        if path is None or path.is_symlink():
+            yield f"{name}: missing"
+        elif path.stat().st_size != fact["bytes"]:
+            yield f"{name}: {path.stat().st_size} bytes, expected {fact['bytes']}"
+        elif durable.hash_file(path) != fact["sha256"]:
+            yield f"{name}: its bytes are not those that were written"
+    yield from (f"{name}: not part of the unit" for name in sorted(present))
+
+
+def read_block(folder: Path, paths: Sequence[str] | None = None) -> Block:
+    """Decodes columns of a unit, all of them by default; the offsets of ragged ones come along.
+
+    Raises:
+        CorruptionError: if an array is missing or a chunk fails its checksum.
+    """
+    import zarr
+
+    arrays: dict[str, Array] = {}
+    path = "zarr.json"
+    try:
+        group = zarr.open_group(folder, mode="r")
+        names = json.loads((folder / "zarr.json").read_bytes())["attributes"]["dapdata"]["files"]
+        stored = [name.removesuffix("/zarr.json") for name in names if name.count("/") == 2 and name.endswith("zarr.json")]
+        wanted = stored if paths is None else _with_offsets(paths)
+        for path in wanted:
+            arrays[path] = _decoded(folder, group, path, names)
+        demos = len(json.loads((folder / "zarr.json").read_bytes())["attributes"]["dapdata"]["rows"])
+    except (OSError, ValueError, KeyError, TypeError, RuntimeError) as error:
+        raise CorruptionError(
+            f"{folder}: {path}: cannot be decoded ({error}); expected the bytes that were written: run `dapdata verify`"
+        ) from error
+    return Block(arrays, demos)
+
+
+def _decoded(folder: Path, group: Any, path: str, names: Mapping[str, Any]) -> Array:
+    """One array; zarr reads a chunk that isn't there as fill values, so files that should be there are looked for."""
+    for name in names:
+        if name.startswith(f"{path}/") and not (folder / name).is_file():
+            raise FileNotFoundError(f"{name} is missing")
+    array: Array = group[path][...]
+    return array
+
+
+def _with_offsets(paths: Sequence[str]) -> list[str]:
+    offsets = {offsets_path(path) for path in paths if is_ragged(COLUMNS[path])}
+    return [*sorted(offsets), *paths]
+
+
+def created_by() -> dict[str, str]:
+    """The versions that wrote the bytes: what a bug report needs."""
+    return {name: version(name) for name in ("numpy", "zarr")}

@@ -1,0 +1,52 @@
+"""Datasets that several tests look at, each built once; whoever changes one takes a copy."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+import toy_stages
+
+from dapdata import pipeline, recipe
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+TINY = {
+    "name": "tiny",
+    "seed": 3,
+    "demos": 5,
+    "shard_size": 3,
+    "scene": {"task": "can_cabinet"},
+    "cameras": {"width": 160, "height": 120},
+    "split": {"val": 0.2, "test": 0.2},
+}
+
+
+@pytest.fixture(scope="session")
+def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A small labelled dataset of true scenes, through simulator, cameras, superpoints and labels. Not to be changed."""
+    root = tmp_path_factory.mktemp("tiny") / "tiny"
+    pipeline.generate(recipe.from_resolved(TINY), root, engine="inline")
+    pipeline.label(root, engine="inline")
+    return root
+
+
+@pytest.fixture(scope="session")
+def toy(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A labelled dataset of random arrays: 8 demos asked for, in units of 3. Not to be changed."""
+    return make_toy(tmp_path_factory.mktemp("toy") / "toy")
+
+
+@pytest.fixture
+def toy_copy(toy: Path, tmp_path: Path) -> Path:
+    """A copy of `toy` that a test may damage."""
+    return Path(shutil.copytree(toy, tmp_path / "toy"))
+
+
+def make_toy(root: Path, demos: int = 8, shard_size: int = 3, workers: int = 1, engine: str = "inline") -> Path:
+    """Generates and labels with the toy stages."""
+    pipeline.generate(toy_stages.toy_recipe(demos, shard_size), root, workers=workers, engine=engine, table="toy_stages")
+    pipeline.label(root, workers=workers, engine=engine, table="toy_stages")
+    return root

@@ -1,0 +1,196 @@
+"""Generate and label: the same content whatever the workers and the shards, and nothing made twice."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+import toy_stages
+from conftest import make_toy
+from toy_stages import toy_recipe
+
+import dapdata
+from dapdata import health, manifest, pipeline
+from dapdata.errors import FormatError, RecipeError, UsageError
+from dapdata.plan import Plan
+
+TABLE = "toy_stages"
+
+
+def content(root: Path) -> str:
+    return manifest.read(root).content_sha256
+
+
+@pytest.fixture
+def calls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A file with a line for each call of a stage from here on."""
+    path = tmp_path / "calls"
+    path.touch()
+    monkeypatch.setenv("TOY_CALLS", str(path))
+    return path
+
+
+def test_content_is_the_same_for_two_workers_and_for_other_shards(toy: Path, tmp_path: Path) -> None:
+    assert content(make_toy(tmp_path / "workers", workers=2, engine="local")) == content(toy)
+    assert content(make_toy(tmp_path / "shards", shard_size=5)) == content(toy)
+
+
+def test_content_and_bytes_are_the_same_in_any_order(toy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = pipeline._Command._jobs
+    monkeypatch.setattr(pipeline._Command, "_jobs", lambda self: dict(reversed(whole(self).items())))
+    other = make_toy(tmp_path / "toy")
+    assert (other / "manifest.json").read_bytes() == (toy / "manifest.json").read_bytes()
+    assert (other / "index.parquet").read_bytes() == (toy / "index.parquet").read_bytes()
+
+
+def test_a_longer_dataset_begins_with_the_shorter_and_makes_only_what_is_missing(
+    toy: Path, toy_copy: Path, calls: Path
+) -> None:
+    plan = pipeline.generate(toy_recipe(10), toy_copy, dry_run=True, table=TABLE)
+    assert isinstance(plan, Plan)
+    assert [(s.stage, s.units, s.cached, s.reasons) for s in plan.stages] == [
+        ("demonstrate", 4, 2, ("demos 8 -> 10",)),
+        ("observe", 4, 2, ("demos 8 -> 10",)),
+    ]
+    make_toy(toy_copy, 10)
+    assert Counter(calls.read_text().split())["observe"] == 4  # the last unit, 6..8, is another now, and 9 is new
+    short, long = dapdata.open(toy), dapdata.open(toy_copy)
+    for i in range(len(short)):
+        assert all(np.array_equal(long[i][path], array) for path, array in short[i].items())
+        assert long.index["split"][i] == short.index["split"][i]
+
+
+def test_eps_place_remakes_only_what_reads_it(toy: Path, toy_copy: Path, calls: Path) -> None:
+    plan = pipeline.label(toy_copy, ["label.eps_place=0.02"], dry_run=True, table=TABLE)
+    assert isinstance(plan, Plan)
+    assert [(s.stage, s.cached, s.reasons) for s in plan.stages] == [
+        ("cluster", 3, ()),
+        ("label", 0, ("label.eps_place 0.03 -> 0.02",)),
+    ]
+    assert calls.read_text() == ""
+    pipeline.label(toy_copy, ["label.eps_place=0.02"], engine="inline", table=TABLE)
+    assert set(calls.read_text().split()) == {"label"}
+    assert content(toy_copy) != content(toy)
+    assert manifest.read(toy_copy).recipe["label"]["eps_place"] == 0.02
+    pipeline.label(toy_copy, ["label.eps_place=0.03"], engine="inline", table=TABLE)  # the first labelling is still there
+    assert content(toy_copy) == content(toy)
+    freed = health.gc(toy_copy).to_dict()
+    assert freed["bytes"] > 0
+    assert all(path.startswith("shards/") for path in freed["removed"])
+    assert health.verify(toy_copy).ok
+
+
+def test_noise_remakes_observe_and_no_physics(toy_copy: Path, calls: Path) -> None:
+    changed = toy_recipe(8, noise={"preset": "none"})
+    plan = pipeline.generate(changed, toy_copy, dry_run=True, table=TABLE)
+    assert isinstance(plan, Plan)
+    assert [s.reasons for s in plan.stages] == [(), ("noise.preset d415 -> none",)]
+    pipeline.generate(changed, toy_copy, engine="inline", table=TABLE)
+    assert set(calls.read_text().split()) == {"observe"}
+    with pytest.raises(FormatError, match="not labelled"):
+        dapdata.open(toy_copy)
+    plan = pipeline.label(toy_copy, dry_run=True, table=TABLE)
+    assert isinstance(plan, Plan)
+    assert plan.stages[1].reasons == ("cluster runs again",)
+
+
+def test_nothing_to_do_changes_nothing(toy_copy: Path, calls: Path) -> None:
+    before = {path: path.stat().st_mtime_ns for path in toy_copy.rglob("*") if path.is_file() and path.name != ".lock"}
+    make_toy(toy_copy)
+    assert calls.read_text() == ""
+    assert {path: path.stat().st_mtime_ns for path in toy_copy.rglob("*") if path.is_file() and path.name != ".lock"} == before
+
+
+def test_fresh_makes_all_again(toy: Path, toy_copy: Path, calls: Path) -> None:
+    pipeline.generate(toy_recipe(8), toy_copy, engine="inline", fresh=True, table=TABLE)
+    assert Counter(calls.read_text().split())["observe"] == 8
+    assert not list((toy_copy / "shards").glob("*/*"))
+    pipeline.label(toy_copy, engine="inline", table=TABLE)
+    assert content(toy_copy) == content(toy)
+
+
+def test_rejects_are_counted_by_reason_and_absent_from_the_shards(toy: Path) -> None:
+    found = manifest.read(toy)
+    assert found.rejects.attempts.keys() == {"no_free_slot"}
+    absent = sum(found.rejects.demos.values())
+    assert absent > 0
+    assert found.rejects.demos.keys() == {"empty_cloud"}
+    data = dapdata.open(toy)
+    assert len(data) == found.demos - absent
+    assert sum(found.rejects.attempts.values()) >= sum(int(sample["meta/attempts"]) - 1 for sample in data)
+    assert sum(found.rejects.goals.values()) >= int(data.index["rejected_goals"].sum()) > 0
+
+
+def test_the_manifest_names_every_file_with_its_hash(toy: Path) -> None:
+    report = health.verify(toy)
+    assert report.ok, report
+    count = sum(1 for path in toy.rglob("*") if path.is_file() and path.name not in (".lock", "log.jsonl", "manifest.json"))
+    roots = len({unit.path for stage in manifest.read(toy).stages.values() for unit in stage.units})
+    assert report.files + roots == count
+
+
+def test_shards_take_upstream_files_as_they_are(toy: Path) -> None:
+    shards = [toy / shard.path for shard in manifest.read(toy).shards]
+    assert any((shard / "pose/T_world_container/zarr.json").stat().st_nlink > 1 for shard in shards)
+
+
+def test_a_demo_that_never_comes_about_is_an_error_that_names_the_rejects(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    never = (
+        toy_stages.STAGES[0].__class__(**{**vars(toy_stages.STAGES[0]), "run": lambda *_: toy_stages.Rejected("no_free_slot")}),
+    )
+    monkeypatch.setattr(toy_stages, "STAGES", never + toy_stages.STAGES[1:])
+    with pytest.raises(UsageError, match=r"toy: no demo 0 after 50 attempts \(no_free_slot 50\).*widen"):
+        pipeline.generate(toy_recipe(), tmp_path / "toy", engine="inline", table=TABLE)
+    assert not (tmp_path / "toy/manifest.json").exists()
+
+
+def test_labelling_refuses_what_it_cannot_change(toy: Path) -> None:
+    with pytest.raises(UsageError, match=r"noise.*dapdata generate"):
+        pipeline.label(toy, ["noise.preset=none"], table=TABLE)
+    with pytest.raises(UsageError, match=r"demos.*dapdata generate"):
+        pipeline.label(toy, ["demos=9"], table=TABLE)
+    with pytest.raises(RecipeError, match="eps_place"):
+        pipeline.label(toy, ["label.eps_place=30"], table=TABLE)
+
+
+def test_somebodys_folder_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "thesis.tex").write_text("x")
+    with pytest.raises(FormatError, match="no dataset"):
+        pipeline.generate(toy_recipe(), tmp_path, engine="inline", table=TABLE)
+    with pytest.raises(FormatError, match="a file"):
+        pipeline.generate(toy_recipe(), tmp_path / "thesis.tex", engine="inline", table=TABLE)
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
+
+
+def test_a_dry_run_writes_nothing(tmp_path: Path) -> None:
+    plan = pipeline.generate(toy_recipe(), tmp_path / "toy", dry_run=True, table=TABLE)
+    assert "demonstrate: 2 of 2 units run (6 demos): demonstrate was not run here before" in str(plan)
+    assert not list(tmp_path.iterdir())
+
+
+def test_previews_join_the_manifest_and_the_card(toy_copy: Path, toy: Path) -> None:
+    pipeline.attach(toy_copy, {"preview/goals.png": b"a picture"})
+    assert "preview/goals.png" in manifest.read(toy_copy).files
+    assert "![preview/goals.png]" in (toy_copy / "README.md").read_text()
+    assert health.verify(toy_copy).ok
+    make_toy(toy_copy)
+    assert "preview/goals.png" in manifest.read(toy_copy).files
+    assert content(toy_copy) == content(toy)
+
+
+def test_status_and_inspect_tell_what_is_there(toy: Path) -> None:
+    status, inside = health.status(toy).to_dict(), health.inspect(toy).to_dict()
+    assert json.loads(json.dumps([status, inside]))
+    assert status["published"]["units"] == {"demonstrate": 3, "observe": 3, "cluster": 3, "label": 3}
+    assert inside["demos_in_shards"] == sum(inside["splits"].values())
+    assert inside["per_demo"]["superpoints"]["mean"] == 12.0
+
+
+def test_no_bytes_are_lost_when_a_dataset_is_copied(toy: Path, tmp_path: Path) -> None:
+    assert health.verify(shutil.copytree(toy, tmp_path / "elsewhere")).ok

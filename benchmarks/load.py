@@ -1,26 +1,31 @@
-"""One shuffled pass over a training split's superpoints: from memory, from disk by blocks, and two usual ways.
+"""One shuffled pass over a dataset's superpoints in padded batches: from memory, from disk by blocks, and two usual ways.
 
-Every contender hands out the same five arrays of the same demos as torch tensors, in a random order. Memory is
-filled beforehand (its cost, once, is a row of its own); files are in the page cache for all.
+Every contender reads the same five arrays of the same demos as torch tensors, in a random order, and the same
+function pads them to batches of 16. Memory is filled beforehand (its cost, once, is a row of its own); files are in the
+page cache for all.
 """
 
 from __future__ import annotations
 
 import json
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
 import torch
 import zarr
 from timing import Row, chosen, compare, cpu_ms, main, rows
+from torch.nn.utils.rnn import pad_sequence
 
 import dapdata
 from dapdata import pipeline, recipe, rng
 
 RECIPE = Path(__file__).parents[1] / "recipes/can_cabinet.yaml"
 DEMOS, SHARD = {"quick": 12, "normal": 100, "long": 500}, 25
+BATCH = 16
+Sample = dict[str, torch.Tensor]
 PATHS = [f"container_superpoints/{name}" for name in ("points", "normals", "size", "affordance")] + ["pose/T_world_object_goal"]
 
 
@@ -41,52 +46,52 @@ def _measure(root: Path, demos: int, against: str | None, rounds: int) -> Iterat
         np.savez(root.parent / f"{i}.npz", **{path.replace("/", "."): sample[path] for path in PATHS})
     in_memory, stream = dataset.torch(PATHS), dataset.stream(shuffle=True, paths=PATHS)
 
-    def from_memory() -> object:
-        return [in_memory[int(i)] for i in order]
-
-    def from_npz() -> object:
-        found = []
-        for i in order:
-            with np.load(root.parent / f"{i}.npz") as arrays:
-                found.append({name: torch.from_numpy(arrays[name]) for name in arrays.files})
-        return found
-
     contenders = {
-        "dapdata": from_memory,
-        "block-shuffled": lambda: list(stream),
-        "npz-per-demo": from_npz,
-        "zarr-slices": lambda: _from_slices(root, order),
+        "dapdata": lambda: batches(in_memory[int(i)] for i in order),
+        "block-shuffled": lambda: batches(stream),
+        "npz-per-demo": lambda: batches(from_npz(root.parent, order)),
+        "zarr-slices": lambda: batches(from_slices(root, order)),
     }
     notes = {
         "dapdata": "in memory",
         "block-shuffled": "dapdata's own stream from disk",
         "zarr-slices": "a slice a demo and array",
     }
-    case = f"{demos} demos, {len(PATHS)} arrays"
+    case = f"{demos} demos, {len(PATHS)} arrays, batches of {BATCH}"
     kept = chosen(contenders, against)
     yield from compare("load", case, kept, rounds, lambda call: cpu_ms(call) / demos, "CPU ms/demo", notes)
     once = [cpu_ms(lambda: dataset.torch(PATHS)) / demos for _ in range(rounds)]
     yield from rows("load", case, {"  filling memory, once": once}, "CPU ms/demo")
 
 
-def _from_slices(root: Path, order: np.ndarray) -> object:
+def batches(samples: Iterable[Sample]) -> int:
+    """Pads samples to batches of (B, S, ...) and returns how many tensors there were."""
+    rest, made = iter(samples), 0
+    while batch := list(islice(rest, BATCH)):
+        made += len([pad_sequence([sample[path] for sample in batch], batch_first=True) for path in PATHS])
+    return made
+
+
+def from_npz(folder: Path, order: np.ndarray) -> Iterator[Sample]:
+    """The arrays of each demo from a file of its own."""
+    for i in order:
+        with np.load(folder / f"{i}.npz") as arrays:
+            yield {name.replace(".", "/"): torch.from_numpy(arrays[name]) for name in arrays.files}
+
+
+def from_slices(root: Path, order: np.ndarray) -> Iterator[Sample]:
     """The arrays of each demo sliced out of its shard: what the format allows, but not how to train."""
     shards = json.loads((root / "manifest.json").read_text(encoding="utf-8"))["shards"]
     groups = [zarr.open_group(root / shard["path"], mode="r") for shard in shards]
     arrays = [{path: group[path] for path in PATHS} for group in groups]
     offsets = [group["container_superpoints/offsets"][:] for group in groups]
-    size = shards[0]["demos"]
-    found = []
     for i in order:
-        shard, row = divmod(int(i), size)
+        shard, row = divmod(int(i), shards[0]["demos"])
         start, stop = offsets[shard][row : row + 2]
-        found.append(
-            {
-                path: torch.from_numpy(np.asarray(array[row] if path.startswith("pose/") else array[start:stop]))
-                for path, array in arrays[shard].items()
-            }
-        )
-    return found
+        yield {
+            path: torch.from_numpy(np.asarray(array[row] if path.startswith("pose/") else array[start:stop]))
+            for path, array in arrays[shard].items()
+        }
 
 
 if __name__ == "__main__":

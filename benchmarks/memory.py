@@ -43,7 +43,7 @@ def run(scale: str, against: str | None) -> Iterator[Row]:
     names = f"{many} demos", f"{FEW} demos"
     values: dict[str, list[float]] = {name: [] for name in names}
     notes = {}
-    for _ in range(1 if scale == "quick" else 2):
+    for _ in range(2 if scale == "normal" else 1):
         for name, demos in zip(names, (many, FEW)):
             found = peak(demos)
             values[name].append(max(found.values()))

@@ -15,6 +15,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+from dapdata import __version__
 from dapdata.errors import EnvironmentProblem, UsageError, nearest
 
 RIVALS = {  # script: whom it compares with
@@ -24,7 +25,7 @@ RIVALS = {  # script: whom it compares with
     "load": ("block-shuffled", "npz-per-demo", "zarr-slices"),
     "memory": ("10 demos",),
 }
-PACKAGES = ("dapdata", "numpy", "numba", "pybullet", "open3d", "zarr", "torch")
+PACKAGES = ("numpy", "numba", "pybullet", "open3d", "zarr", "torch")
 Row = dict[str, Any]
 
 
@@ -83,6 +84,7 @@ def _rows(script: Path, against: str | None, scale: str) -> Iterator[Row]:
 def machine() -> dict[str, str]:
     """What the figures were measured on: processor, cores, load, versions."""
     about = {"processor": _processor(), "cores": str(os.cpu_count()), "python": platform.python_version()}
+    about["dapdata"] = __version__
     about["load average"] = ", ".join(f"{load:.1f}" for load in os.getloadavg())
     for package in PACKAGES:
         try:

@@ -125,10 +125,11 @@ def _how(manifest: Mapping[str, Any]) -> str:
     recipe = manifest["recipe"]
     lines = ["## How it was made\n"]
     for name, entry in manifest["stages"].items():
-        versions = ", ".join(f"{package} {number}" for package, number in entry["spec"]["packages"].items())
-        lines.append(
-            f"- `{name}` version {entry['spec']['version']} ({versions}), recipe sections {', '.join(entry['spec']['sections'])}"
-        )
+        if not entry["units"]:
+            continue
+        spec, sections = entry["spec"], ", ".join(sorted(entry["spec"]["sections"]))
+        versions = ", ".join(f"{package} {number}" for package, number in sorted(spec["packages"].items()))
+        lines.append(f"- `{name}` version {spec['version']} ({versions}), recipe sections {sections}")
     lines += [
         "",
         f"Seed {recipe['seed']}. The whole recipe, every default filled in, is in `manifest.json`; with it and the versions "

@@ -10,9 +10,11 @@ import errno
 import json
 import logging
 import os
+import shutil
 import signal
 import sys
 from collections.abc import Sequence
+from importlib.util import find_spec
 from pathlib import Path
 from types import FrameType
 from typing import Annotated, Any, Literal
@@ -20,11 +22,10 @@ from typing import Annotated, Any, Literal
 import typer
 
 from dapdata.console import comparison_text, last, made_text, placements_text, progress, remember, report_text, say, show
-from dapdata.errors import DapdataError, UsageError
+from dapdata.errors import DapdataError, UsageError, require
 
-CLICK_ERROR: type[Exception] = typer.BadParameter.__mro__[
-    2
-]  # ClickException, base of all complaints about arguments; not exported
+CLICK_ERROR: type[Exception] = typer.BadParameter.__mro__[2]  # ClickException, of all bad arguments; not exported
+STOPPED, INTERRUPTED = "stopped; the same command, run again, goes on where it stopped", 130
 
 Net = Literal["both", "affordance", "pose"]
 Protocol = Literal["strict", "rpdiff"]
@@ -82,14 +83,14 @@ def run_app(arguments: Sequence[str]) -> int:
     try:
         code = app(args=list(arguments), prog_name="dapdata", standalone_mode=False)
         sys.stdout.flush()
-        return code if isinstance(code, int) else 0
+        return _fail(STOPPED, code) if code == INTERRUPTED else code if isinstance(code, int) else 0
     except DapdataError as error:
         return _fail(str(error), error.exit_code)
     except CLICK_ERROR as error:
         message = error.format_message().rstrip(".")  # type: ignore[attr-defined]
         return _fail(f"{message}; see `dapdata {' '.join(arguments[:1])} --help`", 2)
     except (KeyboardInterrupt, typer.Abort):
-        return _fail("stopped; the same command, run again, goes on where it stopped", 130)
+        return _fail(STOPPED, INTERRUPTED)
     except BrokenPipeError:  # whoever reads our output (head, less) has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
@@ -173,6 +174,8 @@ def generate(
     from dapdata import pipeline
 
     asked = _recipe(recipe, overrides, demos)
+    if not dry_run:
+        _need("sim", "pybullet", "numba", "pebble")
     with progress("generate", "demo") as advance:
         made = pipeline.generate(
             asked, out, workers=workers, engine=engine, fresh=fresh, dry_run=dry_run, progress=None if dry_run else advance
@@ -193,6 +196,8 @@ def label(
     from dapdata import pipeline
 
     folder = last("dataset", dataset)
+    if not dry_run:
+        _need("sim", "numba", "pebble")
     with progress("label", "demo") as advance:
         made = pipeline.label(
             folder, overrides or (), workers=workers, engine=engine, dry_run=dry_run, progress=None if dry_run else advance
@@ -280,9 +285,6 @@ def train(
 ) -> None:
     """Train on the train split. Goes on where it stopped; keeps the best (held-out) and the last weights."""
     from dapdata import manifest, recipe
-    from dapdata.errors import require
-
-    require("torch", "train")
     from daptrain import train as train_networks
 
     folder = last("dataset", dataset)
@@ -304,24 +306,32 @@ def evaluate(
     split: InSplit = "test",
     trials: Trials = None,
     protocol: Rules = None,
-    method: Annotated[str, typer.Option("--method", help="dap, cap, oracle, random or heuristic.")] = "dap",
+    method: Annotated[
+        str | None, _option("--method", help="dap, cap; or oracle, random, heuristic, without a run", default="the run's")
+    ] = None,
     k: K = None,
     device: Device = "auto",
     workers: Workers = 1,
+    out: Annotated[Path | None, _option("--out", help="Folder to write", default="the run", metavar="DIR")] = None,
     as_json: Json = False,
 ) -> None:
     """Predict on a split, then judge in physics. Writes predictions.npz, report.json, report.html, pictures of failures."""
-    from dapdata.errors import require
-
-    require("torch", "train")
     from daptrain import evaluate as evaluate_run
+    from daptrain.checkpoint import read_description
 
-    folder = last("run", run)
+    if method in (None, "dap", "cap"):
+        run = last("run", run)
+        method = method or str(read_description(run)["method"])
+    elif run is not None:  # a report of another method must not replace the run's own
+        out = out or run.parent / f"{method}-{run.name}"
+    elif data is None:
+        data = last("dataset", None)
     report = evaluate_run(
-        folder, data, split=split, trials=trials, protocol=protocol, method=method, k=k, device=device, workers=workers
+        run, data, split=split, trials=trials, protocol=protocol, method=method, k=k, device=device, workers=workers, out=out
     )
-    remember(run=folder)
-    _show_report(report, as_json)
+    if run is not None:
+        remember(run=run)
+    show(report, as_json, report_text(report))
 
 
 @app.command(epilog="Example: dapdata judge mine.npz --data data/can_cabinet --out mine.json")
@@ -369,9 +379,6 @@ def predict(
     as_json: Json = False,
 ) -> None:
     """Rank placements for your own scans. Each is the motion that carries the scanned object to its place."""
-    from dapdata.errors import require
-
-    require("torch", "train")
     from daptrain import predict as predict_placements
 
     placements = predict_placements(run, container, thing, k=k, seed=seed, device=device)
@@ -408,10 +415,9 @@ def run(
 ) -> None:
     """Generate, label, train and eval. Then say how well it went and where everything is."""
     from dapdata import pipeline
-    from dapdata.errors import require
 
-    for package, extra in (("pybullet", "sim"), ("numba", "sim"), ("torch", "train")):
-        require(package, extra)  # before the first minute is spent
+    _need("sim", "pybullet", "numba", "pebble", "matplotlib")
+    _need("train", "torch")
     from daptrain import evaluate as evaluate_run
     from daptrain import train as train_networks
 
@@ -422,6 +428,8 @@ def run(
         pipeline.label(dataset, workers=workers, engine=engine, progress=advance)
     remember(dataset=dataset)
     target = run_folder or Path("runs") / dataset.resolve().name
+    if fresh and (target / "config.json").is_file():
+        shutil.rmtree(target)
     train_networks(dataset, target, minutes=minutes, device=device, config=asked.train)
     remember(run=target)
     report = evaluate_run(target, dataset, trials=trials, k=k, device=device, workers=workers)
@@ -453,6 +461,13 @@ def bench(
 # What several commands do ----------------------------------------------------------------------------------
 
 
+def _need(extra: str, *packages: str) -> None:
+    """Raises a MissingExtraError before anything is written if a package is not installed; imports none of them."""
+    for package in packages:
+        if find_spec(package) is None:
+            require(package, extra)
+
+
 def _recipe(path: Path, overrides: list[str] | None, demos: int | None) -> Any:
     """The recipe that a command line asks for."""
     from dapdata.recipe import load
@@ -475,7 +490,7 @@ def _folder(made: Any) -> Path:
 
 
 def _show_report(report: dict[str, Any], as_json: bool) -> None:
-    """Shows a report, then raises if its judge is broken."""
+    """Shows a report, then raises a CorruptionError if its judge is broken."""
     from dapdata.metrics import require_sound
     from dapdata.report import Report
 
@@ -489,7 +504,7 @@ def _leave_behind(dataset: Path, run: Path) -> dict[str, Path]:
     from dapdata.loading import open as open_dataset
     from dapdata.show import contact_sheet, show_html
 
-    sample = open_dataset(dataset, "test")[0]
+    sample = next(iter(open_dataset(dataset, "test")), None) or open_dataset(dataset)[0]
     scans = {name: run / f"{name}.ply" for name in ("container", "object")}
     for name, path in scans.items():
         write_ply(path, sample[f"{name}/points"], sample[f"{name}/normals"])

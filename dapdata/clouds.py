@@ -5,6 +5,7 @@ Normals are needed, unit or not, and point to the sensor: which side of a surfac
 
 from __future__ import annotations
 
+import tokenize
 import zipfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -21,6 +22,7 @@ FIELDS = ("x", "y", "z", "nx", "ny", "nz")
 PCD_NAMES = {"normal_x": "nx", "normal_y": "ny", "normal_z": "nz"}
 MAX_HEADER = 65_536  # bytes
 MAX_POINTS = 20_000_000
+BROKEN = (ValueError, EOFError, MemoryError, SyntaxError, tokenize.TokenError)  # what numpy raises at damaged headers
 PLY_TYPES = {
     "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4", "double": "f8",
     "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4", "float32": "f4", "float64": "f8",
@@ -157,7 +159,7 @@ def _read_npz(path: Path) -> Array:
             raise FormatError(f"{path}: unpacks to more than {MAX_POINTS} points, expected fewer")
         with np.load(path, allow_pickle=False) as arrays:
             points, normals = arrays["points"], arrays["normals"]
-    except (zipfile.BadZipFile, ValueError, EOFError, MemoryError) as error:
+    except (zipfile.BadZipFile, NotImplementedError, KeyError, *BROKEN) as error:
         if isinstance(error, FormatError):
             raise
         raise FormatError(f"{path}: is no npz file of plain arrays ({error}), expected `points` and `normals`") from error
@@ -169,7 +171,7 @@ def _read_npz(path: Path) -> Array:
 def _read_npy(path: Path) -> Array:
     try:
         rows = np.load(path, allow_pickle=False, mmap_mode="r")
-    except (ValueError, EOFError, MemoryError) as error:
+    except BROKEN as error:
         raise FormatError(f"{path}: is no npy file of plain numbers ({error}), expected (N, 6)") from error
     if rows.ndim != 2 or rows.shape[1] != 6 or rows.dtype.kind not in "fiu" or len(rows) > MAX_POINTS:
         raise FormatError(f"{path}: shape {rows.shape}, expected (N, 6): x y z and the normal of each point")

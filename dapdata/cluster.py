@@ -32,7 +32,7 @@ class SuperpointsConfig(Section):
     object_count: int = key(32, "wanted superpoints of the object, met within 10 %", ge=1, le=20_000)
     iterations: int = key(4, "rounds of slic", ge=1, le=50)
     normal_weight: float = key(
-        1.0, "what a right angle between normals weighs, in cells of distance; larger: purer, more ragged", ge=0, le=20
+        1.5, "what a right angle between normals weighs, in cells of distance; larger: purer, more ragged", ge=0, le=20
     )
     plane_weight: float = key(2.0, "what a cell of distance from the superpoint's plane weighs; larger: flatter", ge=0, le=20)
 

@@ -45,17 +45,21 @@ def _ordered(ends: tuple[Number, Number]) -> tuple[Number, Number]:
 
 
 # Ranges [lowest, highest] that a value is drawn from, both ends included.
-_Length = Annotated[float, Field(ge=0, le=10)]
+_Length = Annotated[float, Field(ge=0, le=2)]
+_Size = Annotated[float, Field(ge=0.001, le=2)]
 _Factor = Annotated[float, Field(ge=0, le=10)]
 _Share = Annotated[float, Field(ge=0, le=1)]
 _Signed = Annotated[float, Field(ge=-10, le=10)]
 _Count = Annotated[int, Field(ge=0, le=1000)]
+_PositiveCount = Annotated[int, Field(ge=1, le=20)]
 _Degrees = Annotated[float, Field(ge=-180, le=180)]
 LengthRange = Annotated[tuple[_Length, _Length], BeforeValidator(_pair), AfterValidator(_ordered)]
+SizeRange = Annotated[tuple[_Size, _Size], BeforeValidator(_pair), AfterValidator(_ordered)]
 FactorRange = Annotated[tuple[_Factor, _Factor], BeforeValidator(_pair), AfterValidator(_ordered)]
 ShareRange = Annotated[tuple[_Share, _Share], BeforeValidator(_pair), AfterValidator(_ordered)]
 CoordinateRange = Annotated[tuple[_Signed, _Signed], BeforeValidator(_pair), AfterValidator(_ordered)]
 CountRange = Annotated[tuple[_Count, _Count], BeforeValidator(_pair), AfterValidator(_ordered)]
+PositiveCountRange = Annotated[tuple[_PositiveCount, _PositiveCount], BeforeValidator(_pair), AfterValidator(_ordered)]
 DegreesRange = Annotated[tuple[_Degrees, _Degrees], BeforeValidator(_pair), AfterValidator(_ordered)]
 
 
@@ -108,7 +112,7 @@ class TrainConfig(Section):
     heads: int = key(2, "attention heads of a Point-DiT block; must divide width", ge=1, le=64)
     groups: int = key(6, "channel groups of vector attention; must divide point_width and pose_width", ge=1, le=64)
     neighbours: int = key(16, "points that a point attends to within its cloud", ge=2, le=256)
-    cross_neighbours: int = key(32, "points that a point attends to in the other cloud", ge=2, le=1024)
+    cross_neighbours: int = key(16, "points that a point attends to in the other cloud", ge=2, le=1024)
     container_points: int = key(4096, "raw points kept of a container", ge=64, le=1_000_000)
     crop_points: int = key(192, "raw points that net 2 sees around a region", ge=16, le=100_000)
     object_points: int = key(96, "points that net 2 sees of an object", ge=16, le=100_000)

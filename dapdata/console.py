@@ -116,7 +116,8 @@ def rate(interval: Mapping[str, Any]) -> str:
 def report_text(report: Mapping[str, Any]) -> str:
     """A report in a dozen lines: the method's success next to the references'."""
     success = report["success"]
-    head = f"{report['task']}, {report['split']['name']} split, {report['judge']['protocol']} protocol, K = {report['method']['k']}"
+    judged = f"{report['split']['name']} split, {report['judge']['protocol']} protocol, K = {report['method']['k']}"
+    head = f"{report['task']}, {judged}"
     lines = [head, f"  {report['method']['name']}:"]
     for name in ("top1", "any_of_K", "single", "precise", "near_goal", "tight"):
         lines.append(f"    success_{name:<9} {rate(success[f'success_{name}'])}")

@@ -25,6 +25,7 @@ from typing import Any
 from dapdata.errors import EnvironmentProblem, LockedError
 
 STAGING = "staging"
+TEMPORARY = ".*.tmp"  # names that are half-written until they are renamed
 FULL_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 NO_PERMISSION = (errno.EACCES, errno.EPERM, errno.EROFS)
 
@@ -134,7 +135,7 @@ def discard(root: Path, path: Path) -> None:
 def sweep(root: Path) -> None:
     """Removes what killed processes left in staging and half-written names; only under the lock."""
     shutil.rmtree(root / STAGING, ignore_errors=True)
-    for leftover in root.glob(".*.tmp"):
+    for leftover in [*root.glob(TEMPORARY), *root.glob(f"*/{TEMPORARY}")]:
         leftover.unlink()
 
 
@@ -162,6 +163,15 @@ def lock(root: Path) -> Iterator[None]:
         finally:
             sweep(root)
             file.truncate(0)
+
+
+def holder(root: Path) -> str | None:
+    """Who works on the dataset now, as it said itself; None if nobody does."""
+    try:
+        words = (root / ".lock").read_text()
+    except OSError:
+        return None
+    return words if words and Path("/proc", words.split()[1]).exists() else None
 
 
 @contextmanager

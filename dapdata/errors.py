@@ -84,9 +84,9 @@ def require(module: str, extra: str) -> ModuleType:
     try:
         return importlib.import_module(module)
     except ImportError as error:
+        where = " (on Python 3.11: PyBullet has no wheels for later ones)" if module == "pybullet" else ""
         raise MissingExtraError(
-            f"{module}: could not be imported ({error}), needed for this command; "
-            f"run: pip install 'dapdata[{extra}]' (on Python 3.11 for the simulator)"
+            f"{module}: could not be imported ({error}), needed for this command; run: pip install 'dapdata[{extra}]'{where}"
         ) from error
 
 

@@ -138,10 +138,10 @@ def _extra_files(root: Path, found: Manifest) -> Iterator[str]:
     """Names in the dataset's folder that nobody put there: besides units, which `_unit_files` looks into."""
     for path in sorted(root.iterdir()):
         known = path.name in OWN_FOLDERS if path.is_dir() else path.name in (*OWN_FILES, *found.files)
-        if not known:
+        if not known and not path.match(durable.TEMPORARY):
             yield f"{path.name}: not part of the dataset"
     for path in sorted((root / manifest.PREVIEWS).glob("*")):
-        if path.relative_to(root).as_posix() not in found.files:
+        if path.relative_to(root).as_posix() not in found.files and not path.match(durable.TEMPORARY):
             yield f"{path.relative_to(root)}: not part of the dataset"
     for path in sorted([*root.glob("shards/*"), *root.glob("shards/*/*"), *root.glob("stages/*"), *root.glob("stages/*/*")]):
         if not path.is_dir() or path.is_symlink():
@@ -250,7 +250,7 @@ def status(root: str | Path) -> Facts:
     facts = {
         "root": str(root),
         "published": published,
-        "working": (root / manifest.PROGRESS).is_file(),
+        "working": durable.holder(root),
         "in_progress": _in_progress(root, log),
         "quarantined": sorted(path.name for path in root.glob("quarantine/*.json")),
         "cpu_seconds": _cpu_seconds(log),

@@ -23,7 +23,7 @@ from dapdata.split import SPLITS
 from dapdata.store import COLUMNS, Block, Sample
 
 if TYPE_CHECKING:
-    import torch.utils.data
+    from torch.utils import data
 
 BLOCKS_HELD = 4  # shards whose demos a shuffled stream mixes
 
@@ -115,7 +115,7 @@ class Dataset:
             )
         return store.read_block(folder, _known_paths(paths))
 
-    def torch(self, paths: Sequence[str] | None = None) -> torch.utils.data.Dataset[Any]:
+    def torch(self, paths: Sequence[str] | None = None) -> data.Dataset[Any]:
         """A map-style dataset of {path: tensor}, all of it in memory.
 
         Args:
@@ -123,7 +123,7 @@ class Dataset:
         """
         require("torch", "train")
         kind: Any = _torch_classes()["InMemory"]
-        dataset: torch.utils.data.Dataset[Any] = kind(self, paths)
+        dataset: data.Dataset[Any] = kind(self, paths)
         return dataset
 
     def stream(
@@ -134,7 +134,7 @@ class Dataset:
         rank: int | None = None,
         world_size: int | None = None,
         even: bool = True,
-    ) -> torch.utils.data.IterableDataset[Any]:
+    ) -> data.IterableDataset[Any]:
         """An iterable dataset of {path: tensor} from disk, a few shards in memory at a time.
 
         Ranks and DataLoader workers get parts that don't overlap and together are everything. Each pass is shuffled
@@ -152,7 +152,7 @@ class Dataset:
         require("torch", "train")
         kind: Any = _torch_classes()["Stream"]
         order = Order(self, shuffle, seed, *_rank(rank, world_size), even)
-        stream: torch.utils.data.IterableDataset[Any] = kind(self, order, paths)
+        stream: data.IterableDataset[Any] = kind(self, order, paths)
         return stream
 
 
@@ -258,7 +258,7 @@ def _torch_classes() -> dict[str, Any]:
     """{"InMemory": class, "Stream": class}: made once, because their bases come from torch."""
     if _classes:
         return _classes
-    import torch.utils.data as data
+    from torch.utils import data
 
     class InMemory(data.Dataset[Any]):
         """Demos as {path: tensor}, decoded once and kept."""

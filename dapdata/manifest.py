@@ -59,7 +59,7 @@ class StageEntry(Section):
     """How a stage was run, and the units that came of it."""
 
     spec: dict[str, Any] = Field(description="version, recipe sections and packages that decide its results")
-    units: list[UnitEntry] = Field(description="in demo order")
+    units: list[UnitEntry] = Field(description="in demo order; empty if it is to be run again")
 
 
 class SplitEntry(Section):
@@ -91,7 +91,7 @@ class Manifest(Section):
     shards: list[UnitEntry] = Field(description="in demo order; empty until the dataset is labelled")
     splits: dict[str, SplitEntry] = Field(description="train, val, test; unused: would share an instance with two of them")
     rejects: Rejects
-    stages: dict[str, StageEntry] = Field(description="every stage that is complete; the units of the last are the shards")
+    stages: dict[str, StageEntry] = Field(description="every stage that was run; the units of the last are the shards")
     files: dict[RelativePath, Sha256] = Field(description="every other file that belongs to the dataset")
     created_by: dict[str, str] = Field(description="versions of the packages that wrote it")
 

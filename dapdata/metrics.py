@@ -295,7 +295,7 @@ def _geometry(results: Sequence[SceneResult]) -> Geometry:
     with_top = [r for r in results if r.verdicts]
     top = [r.verdicts[0] for r in with_top]
     return Geometry(
-        penetration_mm=quantiles(np.array([v.penetration for v in top]) * 1000),
+        penetration_mm=quantiles(np.array([max(v.penetration, 0.0) for v in top if np.isfinite(v.penetration)]) * 1000),
         gap_mm=quantiles(np.array([v.gap for v in top]) * 1000),
         collision_free=rate(np.array([bool(r.verdicts) and r.verdicts[0].penetration <= FREE for r in results])),
         goal_surface_mm=quantiles(np.array([r.distance[0].min() for r in with_top]) * 1000),

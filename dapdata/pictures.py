@@ -156,8 +156,9 @@ def goal_picture(sample: Sample, camera: Camera) -> Array:
 def _object_pictures(sample: Sample, side: int) -> dict[str, Array]:
     """The object's cloud at its start pose, by height within it and by superpoint."""
     points, normals = sample["object/points"].astype(float), sample["object/normals"].astype(float)
-    camera = frame(points, (1, -0.6, 0.6), side, side)
-    seen = splat(blank(camera).camera, points, normals, 0.6 * POINT_RADIUS)
+    radius = 0.6 * POINT_RADIUS  # the object's cloud is finer than the container's
+    camera = frame(np.r_[points - radius, points + radius], (1, -0.6, 1.0), side, side)  # from above: below is not seen
+    seen = splat(blank(camera).camera, points, normals, radius)
     low, span = points[:, 2].min(), max(float(np.ptp(points[:, 2])), 1e-6)
     superpoint = sample["object/superpoint"]
     pictures = {}

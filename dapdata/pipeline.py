@@ -134,7 +134,7 @@ def label(
     found = manifest.read(root)
     given = import_module(table).parse(found.recipe, overrides, str(root / manifest.MANIFEST))
     resolved = recipe.resolve(given)
-    made = {name: entry.spec for name, entry in found.stages.items() if name in GENERATE}
+    made = {name: entry.spec for name, entry in found.stages.items() if name in GENERATE and entry.units}
     if made.keys() != set(GENERATE):
         raise FormatError(f"{root}: stages {sorted(made)}, expected {', '.join(GENERATE)}; run `dapdata generate` first")
     _refuse_upstream(found.recipe, resolved, made)
@@ -194,7 +194,7 @@ class _Command:
         with durable.disk_problems(self.root, needed), durable.lock(self.root):
             if fresh:
                 _clear(self.root)
-            jobs = self._jobs()
+            jobs = self._jobs(needed)
             if jobs:
                 progress_file = {"recipe": self.resolved, "specs": self.specs, "stages": list(self.wanted)}
                 durable.replace_file(self.root / manifest.PROGRESS, durable.canonical(progress_file))
@@ -203,14 +203,14 @@ class _Command:
             units.publish(self.layout, self.stages, self.resolved, self.recipe.split, self.units)
         return self.root
 
-    def _jobs(self) -> dict[str, Unit]:
+    def _jobs(self, needed: int) -> dict[str, Unit]:
         """The units of which something is missing, by their job."""
         todo = sorted({unit for name in self.wanted for unit in missing(self.layout, name, self.units)}, key=lambda u: u.index)
-        return {self._job(unit): unit for unit in todo}
+        return {self._job(unit, needed): unit for unit in todo}
 
-    def _job(self, unit: Unit) -> str:
-        place = (unit.index, unit.start, unit.stop)
-        return units.Work(str(self.root), self.table, self.resolved, self.specs, place, tuple(self.wanted)).to_json()
+    def _job(self, unit: Unit, needed: int) -> str:
+        place, stages = (unit.index, unit.start, unit.stop), tuple(self.wanted)
+        return units.Work(str(self.root), self.table, self.resolved, self.specs, place, stages, needed).to_json()
 
     def _work(self, engine: engines.Engine, jobs: Mapping[str, Unit], workers: int, progress: Progress | None) -> None:
         """Has the jobs done; those that could not be are kept apart with what is needed to replay them."""

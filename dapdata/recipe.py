@@ -92,7 +92,7 @@ def _validate(source: Source, overrides: Sequence[str]) -> Recipe:
     for override in overrides:
         source.override(override)
     model = recipe_class(_task(source))
-    schema = model.model_json_schema()
+    schema = _schema(model)
     tree = _open_empty_sections(source.tree, schema, ())
     try:
         return model.model_validate_json(json.dumps(tree))  # JSON: a list is a tuple, an int is a float, nothing else bends
@@ -101,6 +101,12 @@ def _validate(source: Source, overrides: Sequence[str]) -> Recipe:
             _explain(source, tree, schema, item)
     source.stop_if_wrong()
     raise AssertionError("a ValidationError without errors")
+
+
+@cache
+def _schema(model: type[Recipe]) -> dict[str, Any]:
+    """The JSON Schema of a recipe class, made once: every unit of work validates its recipe. Not to be changed."""
+    return model.model_json_schema()
 
 
 def _task(source: Source) -> str:

@@ -431,9 +431,10 @@ class _World:
         """An empty world."""
         b, client = self._bullet, self._client
         b.resetSimulation(physicsClientId=client)
-        # Islands of one: copies of the object are solved apart, so that none depends on how many others there are.
+        # Islands are never solved together: the solver stops when all it was given has converged, so that otherwise each
+        # copy of the object would depend on the others.
         b.setPhysicsEngineParameter(
-            fixedTimeStep=TIME_STEP, deterministicOverlappingPairs=1, minimumSolverIslandSize=1, physicsClientId=client
+            fixedTimeStep=TIME_STEP, deterministicOverlappingPairs=1, minimumSolverIslandSize=0, physicsClientId=client
         )
         # PyBullet tessellates the shape of a body that has no visual of its own, which takes longer than all the rest.
         self._visual = b.createVisualShape(b.GEOM_BOX, halfExtents=[0.01] * 3, physicsClientId=client)
@@ -469,15 +470,13 @@ class _World:
     def _compound(self, kind: Array, size: Array, T: Array) -> int:
         """One collision shape of several solids."""
         b = self._bullet
-        types = {solids.BOX: b.GEOM_BOX, solids.CYLINDER: b.GEOM_CYLINDER, solids.ELLIPSOID: b.GEOM_MESH}
         placed = [_to_bullet(pose_) for pose_ in T]
         return int(
             b.createCollisionShapeArray(
-                shapeTypes=[types[int(k)] for k in kind],
+                shapeTypes=[b.GEOM_BOX if k == solids.BOX else b.GEOM_CYLINDER for k in kind],
                 halfExtents=(size / 2).tolist(),
                 radii=(size[:, 0] / 2).tolist(),
                 lengths=size[:, 2].tolist(),
-                vertices=[_ellipsoid_hull(s) if k == solids.ELLIPSOID else [] for k, s in zip(kind, size)],
                 collisionFramePositions=[position for position, _ in placed],
                 collisionFrameOrientations=[quaternion for _, quaternion in placed],
                 physicsClientId=self._client,
@@ -597,6 +596,8 @@ def _check_solids(name: str, kind: Array, size: Array, T: Array) -> None:
         raise UsageError(
             f"{name}: got a mesh, expected {', '.join(PART_KINDS[: solids.MESH])}; simulation knows primitives only"
         )
+    if name == "object part" and len(kind) > 1 and np.any(kind == solids.ELLIPSOID):
+        raise UsageError(f"{name}: got an ellipsoid among {len(kind)} parts, expected boxes and cylinders; use it on its own")
     if not (np.all(np.isfinite(T)) and np.all(np.isfinite(size)) and np.all(size > 0)):
         raise UsageError(f"{name}: got sizes or poses that are not finite or not positive, expected metres; correct the scene")
 

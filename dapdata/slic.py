@@ -30,16 +30,19 @@ def seed_groups(points: Array, normals: Array, count: int) -> tuple[Array, float
     """
     direction = np.argmax(np.abs(normals), axis=1)
     direction = 2 * direction + (np.take_along_axis(normals, direction[:, None], 1)[:, 0] < 0)
-    min_points = min(MIN_SEED_POINTS, max(1, len(points) // (2 * count)))
+    min_points = min(MIN_SEED_POINTS, max(1, len(points) // (4 * count)))
     small, large = 0.0, 2 * float(points.max()) + 1e-6
     cell = large / (2 * np.sqrt(count))
     for _ in range(MAX_STEPS):
-        groups = int((_group(points, direction, cell)[1] >= min_points).sum())
-        small, large = (cell, large) if groups >= count else (small, cell)
+        size = _group(points, direction, cell)[1]
+        groups = int((size >= min_points).sum())
+        # In very small cells nearly all groups are slivers, so few count.
+        too_small = groups >= count or len(points) < 1.5 * min_points * len(size)
+        small, large = (cell, large) if too_small else (small, cell)
         if count <= groups <= CLOSE_ENOUGH * count:
             break
         # Surfaces: the number of cells goes with one over the square of their edge.
-        guess = cell * np.sqrt((groups + 1) / (CLOSE_ENOUGH * count))
+        guess = cell * np.sqrt((max(groups, len(size) if too_small else 0) + 1) / (CLOSE_ENOUGH * count))
         cell = guess if small < guess < large else (small + large) / 2
     small = small or large
     group, size = _group(points, direction, small)

@@ -9,7 +9,8 @@ the engine and the paths are not in it, so a dataset grows and moves without bei
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -105,15 +106,18 @@ class Layout:
     seed: int
     shard_size: int
     shard_stage: str
+    _keys: dict[Unit, dict[str, str]] = field(default_factory=dict, compare=False, repr=False)
 
-    @property
+    @cached_property
     def labelling(self) -> str:
         """Short digest of all that decides the shards, but for which demos there are."""
         return durable.digest([FORMAT, dict(self.plan), self.seed, self.shard_size])[:12]
 
     def key(self, stage: str, unit: Unit) -> str:
         """The key of a unit in a stage."""
-        return unit_keys(self.plan, self.seed, unit)[stage]
+        if unit not in self._keys:
+            self._keys[unit] = unit_keys(self.plan, self.seed, unit)
+        return self._keys[unit][stage]
 
     def path(self, stage: str, unit: Unit) -> str:
         """The folder of a unit, from the dataset's; a shard that isn't full says how many demos it is for."""
@@ -155,12 +159,3 @@ def _flat(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]
 
 def _shown(value: Any) -> str:
     return "(not there)" if value is None else str(value)
-
-
-def affected(stages: Sequence[Stage], names: Sequence[str]) -> list[str]:
-    """Stages that run again when the given ones do: they and all that follow from them."""
-    hit = set(names)
-    for stage in stages:
-        if hit & set(stage.needs):
-            hit.add(stage.name)
-    return [stage.name for stage in stages if stage.name in hit]

@@ -28,6 +28,8 @@ from dapdata.records import Array, Record, columns, is_ragged
 FORMAT = 1
 MAX_CHUNK_ROWS = 32768  # fewer rows in a chunk make reading and writing slower, more make nothing faster
 ZSTD_LEVEL = 1  # observed coordinates are noise: level 3 is no smaller
+MAX_RATIO = 1000  # decoded to stored bytes of an array: more is no data of ours but a bomb
+SMALL = 1 << 26  # bytes: arrays up to this are decoded whatever their ratio
 TOLERANCE = 1e-3  # of stored float32 normals
 RIGID_TOLERANCE = 1e-6  # of float64 poses
 
@@ -274,8 +276,7 @@ def _hash_all(folder: Path) -> dict[str, dict[str, Any]]:
 
 def lender(folder: Path, record: Mapping[str, Any]) -> Lender:
     """A committed unit as a lender of all arrays that it holds."""
-    arrays = {name.removesuffix("/zarr.json") for name in record["files"] if name.count("/") == 2}
-    return Lender(folder, record["files"], frozenset(arrays))
+    return Lender(folder, record["files"], frozenset(_stored(record)))
 
 
 # Reading ---------------------------------------------------------------------------------------------------
@@ -294,6 +295,8 @@ def read_record(folder: Path) -> dict[str, Any]:
     """
     try:
         record: dict[str, Any] = json.loads((folder / "zarr.json").read_bytes())["attributes"]["dapdata"]
+        if any(".." in name.split("/") or name.startswith("/") for name in record["files"]):
+            raise ValueError("a file outside of the unit")
         return {**record, "files": dict(record["files"]), "rows": list(record["rows"])}
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise CorruptionError(f"{folder}/zarr.json: cannot be read as a unit ({error}); run `dapdata verify`") from error
@@ -330,18 +333,21 @@ def read_block(folder: Path, paths: Sequence[str] | None = None) -> Block:
     arrays: dict[str, Array] = {}
     path = "zarr.json"
     try:
+        record = read_record(folder)
         group = zarr.open_group(folder, mode="r")
-        names = json.loads((folder / "zarr.json").read_bytes())["attributes"]["dapdata"]["files"]
-        stored = [name.removesuffix("/zarr.json") for name in names if name.count("/") == 2 and name.endswith("zarr.json")]
-        wanted = stored if paths is None else _with_offsets(paths)
-        for path in wanted:
-            arrays[path] = _decoded(folder, group, path, names)
-        demos = len(json.loads((folder / "zarr.json").read_bytes())["attributes"]["dapdata"]["rows"])
+        for path in _stored(record) if paths is None else _with_offsets(paths):
+            arrays[path] = _decoded(folder, group, path, record["files"])
     except (OSError, ValueError, KeyError, TypeError, RuntimeError) as error:
         raise CorruptionError(
             f"{folder}: {path}: cannot be decoded ({error}); expected the bytes that were written: run `dapdata verify`"
         ) from error
-    return Block(arrays, demos)
+    return Block(arrays, len(record["rows"]))
+
+
+def _stored(record: Mapping[str, Any]) -> list[str]:
+    """Paths of the arrays of a unit that this version knows, offsets included."""
+    names = [name.removesuffix("/zarr.json") for name in record["files"] if name.count("/") == 2]
+    return [name for name in names if name in COLUMNS or name.endswith("/offsets")]
 
 
 def _decoded(folder: Path, group: Any, path: str, names: Mapping[str, Any]) -> Array:
@@ -349,6 +355,9 @@ def _decoded(folder: Path, group: Any, path: str, names: Mapping[str, Any]) -> A
     for name in names:
         if name.startswith(f"{path}/") and not (folder / name).is_file():
             raise FileNotFoundError(f"{name} is missing")
+    stored = sum((folder / name).stat().st_size for name in names if name.startswith(f"{path}/"))
+    if group[path].nbytes > max(SMALL, MAX_RATIO * stored):
+        raise ValueError(f"{group[path].nbytes} bytes in {stored} of file")
     array: Array = group[path][...]
     return array
 

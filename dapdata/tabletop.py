@@ -26,6 +26,7 @@ Array = NDArray[Any]
 ARC_CENTRE = np.array([0.3, 0.0, 0.0])  # m: the point that containers face
 START_TRIES = 100  # draws of a start pose before the scene is given up
 START_MARGIN = 0.02  # m between the container's footprint and the object's bounding sphere
+MAX_PARTS = 2000  # in a scene; hundreds already take seconds a demo
 HOVER = 0.0005  # m: candidates are this far above what they stand on, and settle onto it
 
 
@@ -39,6 +40,18 @@ class TabletopConfig(SceneConfig):
     start_y: CoordinateRange = key((-0.6, 0.6), "start position along world y", unit="m")
     start_height: float = key(0.2, "height above the table of a start in any rotation", unit="m", ge=0.05, le=2)
     max_tilt_deg: float = key(15.0, "largest angle from upright that counts as placed", unit="deg", gt=0, le=180)
+
+
+def expect_room(room: float, needed: float, name: str, what: str) -> None:
+    """ValueError if the smallest container that can be drawn has less room (m) along `name` than is needed (m)."""
+    if room < needed:
+        raise ValueError(f"{name}: got {room:.3g} m of room at the least, expected {needed:.3g} m or more for {what}")
+
+
+def expect_few(parts: float, names: str) -> None:
+    """ValueError if the largest scene that can be drawn has more parts than can be handled."""
+    if parts > MAX_PARTS:
+        raise ValueError(f"{names}: got room for {parts:.0f} parts at the most, expected up to {MAX_PARTS}; draw larger ones")
 
 
 @dataclass(frozen=True)

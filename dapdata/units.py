@@ -47,6 +47,7 @@ class Work:
     specs: dict[str, Spec]
     unit: tuple[int, int, int]
     stages: tuple[str, ...]
+    needed: int  # bytes that the command was estimated to write, for the message of a full disk
 
     def to_json(self) -> str:
         """The job as the text that an engine hands over."""
@@ -70,7 +71,7 @@ def run_unit(text: str) -> str:
     """
     work = Work(**json.loads(text))
     try:
-        with durable.disk_problems(Path(work.root)):
+        with durable.disk_problems(Path(work.root), work.needed):
             return json.dumps(_make(work))
     except DapdataError as error:
         return json.dumps({"error": [type(error).__name__, str(error)]})
@@ -86,10 +87,10 @@ def _make(work: Work) -> dict[str, Any]:
     for stage in (stages[name] for name in work.stages):
         if store.is_committed(layout.folder(stage.name, unit)):
             continue
+        start, cpu = time.perf_counter(), time.process_time()
         for need in stage.needs:
             if need not in made:
                 made[need] = _load(layout, stages[need], unit)
-        start, cpu = time.perf_counter(), time.process_time()
         made[stage.name], rejects = _run_stage(stage, recipe, made, unit)
         ran, ran_cpu = time.perf_counter(), time.process_time()
         size = _commit(layout, stages, stage, unit, made, rejects)
@@ -143,8 +144,12 @@ def _draw(seed: int, demo: int, attempt: int, purpose: str) -> Any:
 
 
 def _finished(record: Record, seed: int, demo: int, attempt: int) -> Record:
-    """The record; a Demo is told which one it is."""
-    return replace(record, demo=demo, seed=seed, attempts=attempt + 1) if isinstance(record, Demo) else record  # type: ignore[arg-type]
+    """The record as it will be read back, so that a resumed unit goes on with the same numbers; a Demo is told who it is."""
+    if isinstance(record, Demo):
+        record = replace(record, demo=demo, seed=seed, attempts=attempt + 1)  # type: ignore[arg-type]
+    kind: Any = type(record)
+    stored: Record = read_record(kind, to_sample(record))
+    return stored
 
 
 def _no_demo(recipe: Any, stage: Stage, demo: int, reasons: Counter[str]) -> str:
@@ -273,7 +278,7 @@ def publish(
         shards=shards,
         splits=_splits(rows),
         rejects=_rejects(records),
-        stages={name: StageEntry(spec=layout.plan[name], units=entries[name]) for name in entries},
+        stages=_stage_entries(layout, entries),
         files={},
         created_by={"dapdata": _version()} | store.created_by(),
     )
@@ -295,6 +300,21 @@ def attach(root: Path, pictures: Mapping[str, bytes]) -> None:
     index = manifest.read_index(root)
     rows = [{name: column[i].item() for name, column in index.items()} for i in range(len(index["demo"]))]
     _write(root, now, rows, _previews(root, now) | dict(pictures))
+
+
+def _stage_entries(layout: Layout, entries: Mapping[str, list[UnitEntry]]) -> dict[str, StageEntry]:
+    """What is there; of stages that are not, how they were last run, so that a plan can say what has changed."""
+    try:
+        old = manifest.read(layout.root).stages
+    except DapdataError:
+        old = {}
+    found = {}
+    for name, spec in layout.plan.items():
+        if name in entries:
+            found[name] = StageEntry(spec=spec, units=entries[name])
+        elif name in old:
+            found[name] = StageEntry(spec=old[name].spec, units=[])
+    return found
 
 
 def _version() -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 from pathlib import Path
@@ -15,13 +16,27 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 TINY = {
     "name": "tiny",
-    "seed": 3,
+    "seed": 6,  # of five demos: three for training, one for each other split
     "demos": 5,
     "shard_size": 3,
     "scene": {"task": "can_cabinet"},
     "cameras": {"width": 160, "height": 120},
     "split": {"val": 0.2, "test": 0.2},
 }
+
+
+@pytest.fixture(scope="session")
+def tiny_recipe(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The recipe of `tiny_dataset` as a file (JSON is YAML)."""
+    path = tmp_path_factory.mktemp("recipes") / "tiny.yaml"
+    path.write_text(json.dumps(TINY, indent=1))
+    return path
+
+
+@pytest.fixture(scope="session")
+def tiny_dataset(tiny: Path) -> Path:
+    """The dataset of `tiny_recipe`, labelled. Not to be changed."""
+    return tiny
 
 
 @pytest.fixture(scope="session")

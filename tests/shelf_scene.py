@@ -67,12 +67,53 @@ def make_demo(parts, object_parts, T_world_container, T_world_object_start, T_wo
 
 
 def _boards():
-    parts = [(BOX, (DEPTH, WIDTH, BOARD), (0, 0, level * PITCH + BOARD / 2)) for level in range(3)]
+    """Boards between the walls and in front of the back: nothing overlaps, so that every surface belongs to one part."""
+    inner = WIDTH - 2 * WALL
+    floors = (BOARD / 2, PITCH + BOARD / 2, 2 * PITCH - BOARD / 2)
+    parts = [(BOX, (DEPTH - BOARD, inner, BOARD), (BOARD / 2, 0, floor)) for floor in floors]
     parts += [(BOX, (DEPTH, WALL, 2 * PITCH), (0, side * (WIDTH - WALL) / 2, PITCH)) for side in (-1, 1)]
-    return [*parts, (BOX, (BOARD, WIDTH, 2 * PITCH), (-(DEPTH - BOARD) / 2, 0, PITCH))]
+    return [*parts, (BOX, (BOARD, inner, 2 * PITCH), (-(DEPTH - BOARD) / 2, 0, PITCH))]
 
 
 def _arrays(parts):
     kind = np.array([part[0] for part in parts], np.uint8)
     size = np.array([part[1] for part in parts], float)
     return kind, size, np.stack([pose(None, part[2]) for part in parts])
+
+
+def observe_with_truth(demo: Demo, cameras, noise, rng):
+    """Points, estimated normals and mean true normals (N, 3) of the container, voxelled as `observe` does it."""
+    from dapdata.observe.cameras import container_views
+    from dapdata.observe.fuse import fuse, view_cloud
+    from dapdata.observe.noise import add_noise
+    from dapdata.observe.raycast import cast
+    from dapdata.poses import inverse
+
+    points, normals, truth = [], [], []
+    for view in container_views(demo, cameras, noise, rng):
+        T_camera_part = inverse(view.T_world_camera_true) @ demo.T_world_container @ demo.T_container_part
+        image = cast(demo.part_kind, demo.part_size, T_camera_part, view.K, view.width, view.height)
+        p, n = view_cloud(add_noise(image, view.K, noise.preset, view.noise_seed), view)
+        in_camera = (p - view.T_world_camera[:3, 3]) @ view.T_world_camera[:3, :3]
+        u, v = np.floor((in_camera @ view.K.T)[:, :2] / in_camera[:, 2:]).astype(int).T
+        points, normals = [*points, p], [*normals, n]
+        truth.append(image.normal[v, u] @ view.T_world_camera_true[:3, :3].T)
+    fused = fuse(points, normals, cameras.container_voxel)
+    cell = np.floor(np.concatenate(points).astype(float) / cameras.container_voxel)
+    _, voxel, size = np.unique(cell, axis=0, return_inverse=True, return_counts=True)
+
+    def mean(a):
+        return np.stack([np.bincount(voxel.ravel(), column) for column in a.T], axis=1) / size[:, None]
+
+    agree = np.linalg.norm(mean(np.concatenate(normals)), axis=1) > 0.1
+    return fused.points, fused.normals, mean(np.concatenate(truth))[agree]
+
+
+def purity(superpoint, true_normals):
+    """Coherence (length of the mean true normal, 1 is pure) and share of points over 45 degrees off that mean."""
+    size = np.bincount(superpoint)
+    mean = np.stack([np.bincount(superpoint, column) for column in true_normals.T], axis=1) / size[:, None]
+    length = np.linalg.norm(mean, axis=1)
+    own = np.linalg.norm(true_normals, axis=1)
+    cosine = np.einsum("ij,ij->i", true_normals, mean[superpoint]) / np.maximum(own * length[superpoint], 1e-12)
+    return float((length * size).sum() / size.sum()), float((cosine < np.cos(np.pi / 4)).mean())

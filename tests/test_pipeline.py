@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from collections import Counter
 from pathlib import Path
@@ -10,11 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import toy_stages
-from conftest import make_toy
+from conftest import TINY, make_toy
 from toy_stages import toy_recipe
 
 import dapdata
-from dapdata import health, manifest, pipeline
+from dapdata import durable, health, manifest, pipeline, recipe
 from dapdata.errors import FormatError, RecipeError, UsageError
 from dapdata.plan import Plan
 
@@ -41,7 +42,7 @@ def test_content_is_the_same_for_two_workers_and_for_other_shards(toy: Path, tmp
 
 def test_content_and_bytes_are_the_same_in_any_order(toy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = pipeline._Command._jobs
-    monkeypatch.setattr(pipeline._Command, "_jobs", lambda self: dict(reversed(whole(self).items())))
+    monkeypatch.setattr(pipeline._Command, "_jobs", lambda self, needed: dict(reversed(whole(self, needed).items())))
     other = make_toy(tmp_path / "toy")
     assert (other / "manifest.json").read_bytes() == (toy / "manifest.json").read_bytes()
     assert (other / "index.parquet").read_bytes() == (toy / "index.parquet").read_bytes()
@@ -184,12 +185,38 @@ def test_previews_join_the_manifest_and_the_card(toy_copy: Path, toy: Path) -> N
     assert content(toy_copy) == content(toy)
 
 
+def test_true_demos_depend_on_recipe_seed_and_index_alone(tiny: Path, tmp_path: Path) -> None:
+    fewer = recipe.from_resolved({**TINY, "demos": 2, "shard_size": 1, "name": "other"})
+    root = pipeline.generate(fewer, tmp_path / "tiny", workers=2)
+    assert isinstance(root, Path)
+    pipeline.label(root)
+    part, whole = dapdata.open(root), dapdata.open(tiny)
+    assert part.index["sha256"].tolist() == whole.index["sha256"][:2].tolist()
+    assert part.index["split"].tolist() == whole.index["split"][:2].tolist()
+
+
 def test_status_and_inspect_tell_what_is_there(toy: Path) -> None:
     status, inside = health.status(toy).to_dict(), health.inspect(toy).to_dict()
     assert json.loads(json.dumps([status, inside]))
     assert status["published"]["units"] == {"demonstrate": 3, "observe": 3, "cluster": 3, "label": 3}
     assert inside["demos_in_shards"] == sum(inside["splits"].values())
     assert inside["per_demo"]["superpoints"]["mean"] == 12.0
+
+
+def test_status_says_who_works(toy_copy: Path) -> None:
+    assert health.status(toy_copy).to_dict()["working"] is None
+    with durable.lock(toy_copy):
+        assert f"process {os.getpid()}" in health.status(toy_copy).to_dict()["working"]
+
+
+@pytest.mark.slow
+def test_memory_is_flat_in_the_number_of_demos(tmp_path: Path) -> None:
+    peaks = []
+    for demos in (10, 300):
+        root = make_toy(tmp_path / str(demos), demos, shard_size=10, engine="local")
+        peaks.append(health.status(root).to_dict()["peak_mb"])
+    assert peaks[1] - peaks[0] < 50
+    assert max(peaks) < 600
 
 
 def test_no_bytes_are_lost_when_a_dataset_is_copied(toy: Path, tmp_path: Path) -> None:

@@ -16,7 +16,8 @@ import pytest
 
 pytest.importorskip("matplotlib")
 
-from dapdata import manifest, pictures, records, rng, viewer
+from dapdata import manifest, pictures, records, rng, show, viewer
+from dapdata.errors import UsageError
 from dapdata.poses import pose
 
 BOARD = (0.2, 0.5, 0.01)
@@ -176,6 +177,33 @@ def test_preview_png_decodes_to_what_was_drawn(panels: dict[str, np.ndarray]) ->
 
     decoded = image.imread(io.BytesIO(pictures.png(panels["goals"])), format="png")
     assert np.array_equal(np.round(decoded[..., :3] * 255), panels["goals"])
+
+
+def test_a_dataset_becomes_a_sheet_a_page_and_previews(tiny: Path, tmp_path: Path) -> None:
+    png = show.contact_sheet(tiny, tmp_path / "new" / "sheet.png", count=1)
+    assert png.read_bytes().startswith(b"\x89PNG")
+    html = show.show_html(tiny, tmp_path / "page.html", demos=[2]).read_text(encoding="utf-8")
+    assert "demo 2" in html
+    assert manifest.read(tiny).content_sha256 in html
+    previews = show.preview(tiny)
+    assert set(previews) == {"preview/clouds.png", "preview/goals.png"}
+    assert all(data.startswith(b"\x89PNG") for data in previews.values())
+
+
+def test_shown_demos_are_spread_or_those_asked_for(tiny: Path) -> None:
+    def numbers(shown: list[pictures.Shown]) -> list[int]:
+        return [int(item.sample["meta/demo"]) for item in shown]
+
+    assert numbers(show.choose(tiny, count=3)) == [0, 2, 4]
+    assert numbers(show.choose(tiny, count=100)) == [0, 1, 2, 3, 4]
+    assert numbers(show.choose(tiny, [3, 1])) == [3, 1]
+    assert {item.task for item in show.choose(tiny)} == {"can_cabinet"}
+
+
+def test_a_demo_that_is_not_there_is_named_and_nothing_is_written(tiny: Path, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="demo 99 is not in it, expected one of 0 to 4"):
+        show.contact_sheet(tiny, tmp_path / "folder" / "sheet.png", demos=[99])
+    assert not list(tmp_path.iterdir())
 
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")

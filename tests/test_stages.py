@@ -108,5 +108,5 @@ def test_no_instance_is_in_two_splits() -> None:
 def test_a_demo_between_two_splits_is_unused() -> None:
     wishes = list(islice(split.wanted(SHARES, 1), 10))
     train, test = wishes.index("train"), wishes.index("test")
-    rows = sorted([(train, 1, 11), (test, 2, 22)]) + [(10, 1, 22)]
+    rows = [*sorted([(train, 1, 11), (test, 2, 22)]), (10, 1, 22)]
     assert split.assign(11, rows, SHARES, 1)[10] == split.UNUSED

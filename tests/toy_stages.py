@@ -134,10 +134,12 @@ def cluster(made: Inputs, sections: Sections, draw: Draw) -> Superpoints | Rejec
     return Superpoints(
         container_superpoint=container,
         object_superpoint=thing,
-        container_superpoint_points=np.stack([cloud.container_points[container == s].mean(0) for s in range(parts)]),
+        container_superpoint_points=np.stack(
+            [cloud.container_points[container == s].mean(0, dtype=float) for s in range(parts)]
+        ),
         container_superpoint_normals=cloud.container_normals[:parts],
         container_superpoint_size=np.bincount(container),
-        object_superpoint_points=np.stack([cloud.object_points[thing == s].mean(0) for s in range(4)]),
+        object_superpoint_points=np.stack([cloud.object_points[thing == s].mean(0, dtype=float) for s in range(4)]),
         object_superpoint_normals=cloud.object_normals[:4],
         object_superpoint_size=np.bincount(thing),
     )
@@ -149,9 +151,9 @@ def label(made: Inputs, sections: Sections, draw: Draw) -> Labels:
     apart = np.linalg.norm(points - made["demonstrate"].T_world_object_goal[:3, 3], axis=1)
     return Labels(
         affordance=np.where(apart < 50 * sections["label"].eps_place, 1.0, -1.0),
-        corr_object=np.zeros(3),
-        corr_container=np.arange(3),
-        corr_distance=apart[:3],
+        corr_object=np.zeros(len(apart)),
+        corr_container=np.arange(len(apart)),
+        corr_distance=np.modf(1e6 * apart)[0],  # every bit of the points shows
     )
 
 

@@ -1,4 +1,4 @@
-"""Small made-up demos for the tests of training: cuboids in a three-slot shelf, as clouds on a grid. No simulator, no cameras."""
+"""Made-up demos for the tests of training: a three-slot shelf as clouds on a grid. No simulator, no cameras."""
 
 from __future__ import annotations
 
@@ -49,7 +49,9 @@ def make_sample(seed: int = 0, spacing: float = 0.02) -> dict[str, np.ndarray]:
     points, normals = points[seen], normals[seen]
     superpoint = np.unique(np.floor(np.column_stack((points / 0.05, 2 * normals))), axis=0, return_inverse=True)[1].ravel()
     counts = np.bincount(superpoint)
-    centres, means = (np.stack([np.bincount(superpoint, x[:, i]) for i in range(3)], 1) / counts[:, None] for x in (points, normals))
+    centres, means = (
+        np.stack([np.bincount(superpoint, x[:, i]) for i in range(3)], 1) / counts[:, None] for x in (points, normals)
+    )
     goals = [pose(None, (0.0, y, 0.01 + SIZE[2] / 2)) for i, y in enumerate(SLOTS) if i != filled]
     goals = np.stack([T_world_container @ T for T in goals])
     start = pose(rotation_about(rng.normal(size=3), rng.uniform(0, 3)), (0.6, 0.3, 0.2))

@@ -2,8 +2,9 @@
 
 Normals are computed per view, before fusion, where a pixel's neighbours are known for free. On a plane the inverse
 depth is linear in the pixel, so a plane fit is a linear fit of 1 / z over a window, in which stereo noise has the same
-size everywhere. A window across an edge fits neither side: each pixel therefore chooses, among the windows that
-contain it, one with small residuals, and only one whose plane passes close to the pixel's own depth.
+size everywhere. A window across an edge fits neither side. So a pixel takes the wide window (5 x 5 at 320 x 240) around
+it where that fits as well as the image's noise allows, else the best-fitting of the narrow ones (3 x 3) that contain it,
+and only a plane that passes close to it; a pixel without one, such as one that flies, is dropped.
 A gate on depth differences, the usual way, cannot see a crease and breaks shelves that are seen at a grazing angle.
 """
 
@@ -40,7 +41,11 @@ def view_cloud(depth: Array, view: View) -> tuple[Array, Array]:
     """(n, 3) points and (n, 3) unit normals toward the sensor, world frame, f4, of the pixels that have both."""
     camera = np.array([view.K[0, 0], view.K[1, 1], view.K[0, 2], view.K[1, 2]])
     stride = max(1, round(len(depth) / FIT_ROWS))
-    wide, narrow = _planes(depth, stride, 2 * stride), _planes(depth, stride, stride)
+    height, width = depth.shape
+    rows, columns = -(-height // stride), -(-width // stride)
+    # Made by numpy: its zeros cost nothing where they are not touched.
+    wide, narrow, sums = np.zeros((rows, columns, 4)), np.zeros((rows, columns, 4)), np.zeros((height, columns, 6))
+    _fit_wide(depth, stride, sums, wide)
     precision = wide[::2, ::2, 3]
     fitted = precision[precision > 0]
     good = NOISE_MARGIN / float(np.median(fitted)) if len(fitted) else 0.0
@@ -65,34 +70,24 @@ def fuse(points: list[Array], normals: list[Array], voxel: float) -> Fused:
     return Fused(*_means(np.argsort(keys[:m]), sums, counts))
 
 
-def _planes(depth: Array, stride: int, radius: int) -> Array:
-    """(ceil(H / stride), ceil(W / stride), 4) fits of 1 / z over squares of 2 radius + 1 px, as `_fit_planes` makes them."""
-    height, width = depth.shape
-    rows, columns = -(-height // stride), -(-width // stride)
-    # Made by numpy: its zeros cost nothing where they are not touched.
-    planes = np.zeros((rows, columns, 4))
-    _fit_planes(depth, stride, radius, np.zeros((height, columns, 6)), planes)
-    return planes
-
-
 @njit(cache=True)
-def _fit_planes(depth: Array, stride: int, radius: int, sums: Array, planes: Array) -> None:
-    """Fit 1 / z around every stride-th pixel.
+def _fit_wide(depth: Array, stride: int, sums: Array, planes: Array) -> None:
+    """Fit 1 / z over squares of 4 stride + 1 px around every stride-th pixel.
 
     Args:
         depth: (H, W), m; 0 for none.
         stride: Distance of the fits, px.
-        radius: Each covers a square of 2 radius + 1 px.
         sums: (H, ceil(W / stride), 6) zeros, for the sums over the rows of the windows.
         planes: (ceil(H / stride), ceil(W / stride), 4) zeros, get the fitted 1 / z at the middle (1/m), its slopes along
             u and v (1/m/px), and one over the variance of the residuals (m^2); these stay 0 where there is no fit.
     """
+    radius = 2 * stride
     top, bottom, left, right = _occupied(depth)
     first, last = max((left - radius) // stride, 0), min((right + radius) // stride + 1, planes.shape[1])
     _row_sums(depth, stride, radius, top, bottom, first, last, sums)
     for i in range(max((top - radius) // stride, 0), min((bottom + radius) // stride + 1, planes.shape[0])):
         for j in range(first, last):
-            _fit_plane(sums, i, j, stride, radius, top, bottom, planes)
+            _fit_from_rows(sums, i, j, stride, radius, top, bottom, planes)
 
 
 @njit(cache=True)
@@ -131,8 +126,8 @@ def _row_sums(depth: Array, stride: int, radius: int, top: int, bottom: int, fir
 
 
 @njit(cache=True)
-def _fit_plane(sums: Array, i: int, j: int, stride: int, radius: int, top: int, bottom: int, planes: Array) -> None:
-    """Fill planes[i, j] from the row sums around it, unless the pixels are too few or lie along a line."""
+def _fit_from_rows(sums: Array, i: int, j: int, stride: int, radius: int, top: int, bottom: int, planes: Array) -> None:
+    """Fill planes[i, j] from the row sums around it."""
     n, su, sv, sr, suu, suv, svv, sur, svr, srr = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for row in range(max(i * stride - radius, top), min(i * stride + radius, bottom) + 1):
         y = float(row - i * stride)
@@ -147,6 +142,55 @@ def _fit_plane(sums: Array, i: int, j: int, stride: int, radius: int, top: int, 
         sur += sums[row, j, 4]
         svr += y * sr_row
         srr += sums[row, j, 5]
+    _solve(n, su, sv, sr, suu, suv, svv, sur, svr, srr, stride, i, j, planes)
+
+
+@njit(cache=True)
+def _fit_narrow(depth: Array, i: int, j: int, stride: int, planes: Array) -> None:
+    """Fill planes[i, j] from the square of 2 stride + 1 px around it; one over the variance is -1 where there is no fit."""
+    height, width = depth.shape
+    n, su, sv, sr, suu, suv, svv, sur, svr, srr = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for row in range(max((i - 1) * stride, 0), min((i + 1) * stride + 1, height)):
+        y = float(row - i * stride)
+        for column in range(max((j - 1) * stride, 0), min((j + 1) * stride + 1, width)):
+            z = depth[row, column]
+            if z > 0:
+                x, r = float(column - j * stride), 1.0 / z
+                n += 1.0
+                su += x
+                sv += y
+                sr += r
+                suu += x * x
+                suv += x * y
+                svv += y * y
+                sur += x * r
+                svr += y * r
+                srr += r * r
+    planes[i, j, 3] = -1.0
+    _solve(n, su, sv, sr, suu, suv, svv, sur, svr, srr, stride, i, j, planes)
+
+
+@njit(cache=True)
+def _solve(
+    n: float,
+    su: float,
+    sv: float,
+    sr: float,
+    suu: float,
+    suv: float,
+    svv: float,
+    sur: float,
+    svr: float,
+    srr: float,
+    stride: int,
+    i: int,
+    j: int,
+    planes: Array,
+) -> None:
+    """Fill planes[i, j] by least squares from the sums of 1, x, y, r, x x, x y, y y, x r, y r, r r over a window's pixels.
+
+    Left alone if the pixels are too few or lie along a line.
+    """
     if n < MIN_SAMPLES:
         return
     suu, suv, svv = suu - su * su / n, suv - su * sv / n, svv - sv * sv / n
@@ -159,17 +203,6 @@ def _fit_plane(sums: Array, i: int, j: int, stride: int, radius: int, top: int, 
     planes[i, j, 1] = b
     planes[i, j, 2] = c
     planes[i, j, 3] = 1.0 / (max(srr - b * sur - c * svr, 0.0) / (n - 3) + ROUNDING)
-
-
-@njit(cache=True)
-def _plane_normal(inverse: float, b: float, c: float, x: float, y: float, camera: Array) -> tuple[float, float, float, float]:
-    """Normal n, away from the camera, and its length, of the plane with inverse depth at the ray (x, y, 1) and slopes b, c.
-
-    A plane n . X = 1 has the inverse depth n . (x, y, 1), so its slopes are n / f. The length is one over its distance.
-    """
-    nx, ny = b * camera[0], c * camera[1]
-    nz = inverse - x * nx - y * ny
-    return nx, ny, nz, np.sqrt(nx * nx + ny * ny + nz * nz)
 
 
 @njit(cache=True)
@@ -188,65 +221,78 @@ def _back_project(
     height, width = depth.shape
     n = 0
     normal = np.zeros(3)
-    R = T_world_camera
+    T = T_world_camera
+    step_x, step_y = 1 / camera[0], 1 / camera[1]
     for v in range(height):
+        y = (v + 0.5 - camera[3]) * step_y
         for u in range(width):
             z = float(depth[v, u])
             if z <= 0:
                 continue
-            x, y = (u + 0.5 - camera[2]) / camera[0], (v + 0.5 - camera[3]) / camera[1]
-            if not _choose_normal(wide, narrow, v, u, stride, good, z, x, y, camera, normal):
+            x = (u + 0.5 - camera[2]) * step_x
+            if not _choose_normal(depth, wide, narrow, v, u, stride, good, 1 / z, x, y, camera, normal):
                 continue
             for k in range(3):
-                points[n, k] = (R[k, 0] * x + R[k, 1] * y + R[k, 2]) * z + R[k, 3]
-                normals[n, k] = R[k, 0] * normal[0] + R[k, 1] * normal[1] + R[k, 2] * normal[2]
+                points[n, k] = (T[k, 0] * x + T[k, 1] * y + T[k, 2]) * z + T[k, 3]
+                normals[n, k] = T[k, 0] * normal[0] + T[k, 1] * normal[1] + T[k, 2] * normal[2]
             n += 1
     return n
 
 
 @njit(cache=True)
 def _choose_normal(
+    depth: Array,
     wide: Array,
     narrow: Array,
     v: int,
     u: int,
     stride: int,
     good: float,
-    z: float,
+    r: float,
     x: float,
     y: float,
     camera: Array,
     normal: Array,
 ) -> bool:
-    """Fill the unit normal, camera frame, of the best window that contains pixel (v, u); False when none fits.
+    """Fill the unit normal, camera frame, of the best window around pixel (v, u), 1 / z = r; False when none fits.
 
     That is the wide window around the pixel where its variance is below `good` (1/m^2): there, on a plane or a gently
-    curved surface, averaging over more pixels is right. Elsewhere it is the best of the narrow ones.
+    curved surface, averaging over more pixels is right. Elsewhere it is the best of the narrow windows that contain the
+    pixel, which are fitted as needed.
     """
     i0, j0 = (v + stride // 2) // stride, (u + stride // 2) // stride
-    if i0 < wide.shape[0] and j0 < wide.shape[1]:
-        if wide[i0, j0, 3] * (good + (RESIDUAL_FLOOR / (z * z)) ** 2) > 1.0:
-            if _plane_at(wide, i0, j0, v, u, stride, z, x, y, camera, normal):
-                return True
+    i, j = min(i0, wide.shape[0] - 1), min(j0, wide.shape[1] - 1)
+    limit = good + RESIDUAL_FLOOR * RESIDUAL_FLOOR * r * r * r * r
+    if wide[i, j, 3] * limit > 1 and _plane_at(wide, i, j, v, u, stride, r, x, y, camera, normal):
+        return True
     best = 0.0
     for i in range(max(i0 - 1, 0), min(i0 + 2, narrow.shape[0])):
         for j in range(max(j0 - 1, 0), min(j0 + 2, narrow.shape[1])):
-            if narrow[i, j, 3] > best and _plane_at(narrow, i, j, v, u, stride, z, x, y, camera, normal):
+            if narrow[i, j, 3] == 0:
+                _fit_narrow(depth, i, j, stride, narrow)
+            if narrow[i, j, 3] > best and _plane_at(narrow, i, j, v, u, stride, r, x, y, camera, normal):
                 best = narrow[i, j, 3]
     return best > 0
 
 
 @njit(cache=True)
 def _plane_at(
-    planes: Array, i: int, j: int, v: int, u: int, stride: int, z: float, x: float, y: float, camera: Array, normal: Array
+    planes: Array, i: int, j: int, v: int, u: int, stride: int, r: float, x: float, y: float, camera: Array, normal: Array
 ) -> bool:
-    """Fill the unit normal of a fit, unless its plane passes too far from pixel (v, u) with its depth z and ray (x, y, 1)."""
+    """Fill the unit normal, toward the camera, of a fit, unless pixel (v, u), 1 / z = r, ray (x, y, 1), is off its plane.
+
+    A plane n . X = 1 has the inverse depth n . (x, y, 1), so its slopes are n / f, and its distance from the camera is one
+    over the length of n.
+    """
     b, c = planes[i, j, 1], planes[i, j, 2]
-    inverse = planes[i, j, 0] + b * (u - j * stride) + c * (v - i * stride)
-    nx, ny, nz, length = _plane_normal(inverse, b, c, x, y, camera)
-    if abs(1.0 / z - inverse) * z > MAX_OFF_PLANE * length:
+    fitted = planes[i, j, 0] + b * (u - j * stride) + c * (v - i * stride)
+    nx, ny = b * camera[0], c * camera[1]
+    nz = fitted - x * nx - y * ny
+    length = np.sqrt(nx * nx + ny * ny + nz * nz)
+    if abs(r - fitted) > MAX_OFF_PLANE * length * r or length == 0:
         return False
-    normal[0], normal[1], normal[2] = -nx / length, -ny / length, -nz / length
+    scale = -1 / length
+    normal[0], normal[1], normal[2] = nx * scale, ny * scale, nz * scale
     return True
 
 

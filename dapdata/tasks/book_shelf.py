@@ -16,12 +16,13 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import model_validator
 
 from dapdata import solids
-from dapdata.config import CountRange, FactorRange, LengthRange, ShareRange, key
+from dapdata.config import CountRange, FactorRange, LengthRange, PositiveCountRange, ShareRange, SizeRange, key
 from dapdata.records import Rejected, Scene
 from dapdata.solids import CLUTTER, Part, box
-from dapdata.tabletop import HOVER, Candidate, TabletopConfig, build_scene
+from dapdata.tabletop import HOVER, Candidate, TabletopConfig, build_scene, expect_few, expect_room
 
 Array = NDArray[Any]
 
@@ -33,23 +34,34 @@ class Params(TabletopConfig):
     """The shelf, its books, and the book to place; ranges are [lowest, highest] of a uniform draw."""
 
     task: Literal["book_shelf"] = key("book_shelf", "name of the task")
-    width: LengthRange = key((0.45, 0.75), "outer width of the shelf", unit="m")
-    depth: LengthRange = key((0.195, 0.21), "outer depth of the shelf", unit="m")
-    board: LengthRange = key((0.004, 0.007), "thickness of floors, back and top", unit="m")
-    wall: LengthRange = key((0.0025, 0.007), "thickness of the side walls", unit="m")
-    shelves: CountRange = key((1, 2), "number of floors, one above the other")
+    width: SizeRange = key((0.45, 0.75), "outer width of the shelf", unit="m")
+    depth: SizeRange = key((0.195, 0.21), "outer depth of the shelf", unit="m")
+    board: SizeRange = key((0.004, 0.007), "thickness of floors, back and top", unit="m")
+    wall: SizeRange = key((0.0025, 0.007), "thickness of the side walls", unit="m")
+    shelves: PositiveCountRange = key((1, 2), "number of floors, one above the other")
     shelf_height: float = key(1.15, "distance of floors, in heights of a book", ge=1.03, le=3)
     top_probability: float = key(0.7, "chance of a board on top", ge=0, le=1)
-    book_depth: LengthRange = key((0.175, 0.195), "a book's extent from spine to fore edge", unit="m")
-    book_height: LengthRange = key((0.23, 0.26), "a book's height", unit="m")
-    book_thickness: LengthRange = key((0.03, 0.05), "a book's thickness", unit="m")
+    book_depth: SizeRange = key((0.175, 0.195), "a book's extent from spine to fore edge", unit="m")
+    book_height: SizeRange = key((0.23, 0.26), "a book's height", unit="m")
+    book_thickness: SizeRange = key((0.03, 0.05), "a book's thickness", unit="m")
     book_gap: LengthRange = key((0.001, 0.005), "gap between neighbouring books, one draw a scene", unit="m")
     filling: Literal["full", "random"] = key("full", "floors are full but for opened slots, or books are there by chance")
     occupancy: ShareRange = key((0.4, 0.8), "random: chance that a slot holds a book, one draw a scene")
     open_slots: CountRange = key((3, 5), "full: missing books in a scene")
     narrow_gaps: CountRange = key((2, 4), "full: gaps on a floor that are too narrow for the object")
     object_scale: FactorRange = key((0.9, 0.9), "size of the book to place, in sizes of the others")
-    min_clearance: float = key(0.003, "a gap counts if it leaves the object this free play sideways", unit="m", ge=0, le=0.1)
+    min_clearance: float = key(0.002, "a gap counts if it leaves the object this free play sideways", unit="m", ge=0, le=0.1)
+
+    @model_validator(mode="after")
+    def check_sizes(self) -> Params:
+        """The smallest shelf has room for the thickest book, and the largest one a number of books that can be handled."""
+        thickest = self.book_thickness[1] + 2 * self.book_gap[1]
+        expect_room(self.width[0] - 2 * self.wall[1], thickest, "width", "its walls and a book of book_thickness")
+        expect_room(self.depth[0] - self.board[1], self.book_depth[1] / 2, "depth", "its back and half a book of book_depth")
+        height = self.shelf_height * self.book_height[0] - self.board[1]
+        expect_room(height, self.book_height[0], "shelf_height", "a board and a book of book_height")
+        expect_few(self.width[1] / self.book_thickness[0] * self.shelves[1], "book_thickness")
+        return self
 
 
 @dataclass(frozen=True)

@@ -17,12 +17,13 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import model_validator
 
 from dapdata import solids
-from dapdata.config import CountRange, FactorRange, LengthRange, ShareRange, key
+from dapdata.config import CountRange, FactorRange, LengthRange, PositiveCountRange, ShareRange, SizeRange, key
 from dapdata.records import Rejected, Scene
 from dapdata.solids import CLUTTER, Part, cylinder
-from dapdata.tabletop import HOVER, Candidate, TabletopConfig, build_scene
+from dapdata.tabletop import HOVER, Candidate, TabletopConfig, build_scene, expect_few, expect_room
 
 Array = NDArray[Any]
 
@@ -34,16 +35,16 @@ class Params(TabletopConfig):
     """The cabinet, its cans, and the can to place; ranges are [lowest, highest] of a uniform draw."""
 
     task: Literal["can_cabinet"] = key("can_cabinet", "name of the task")
-    width: LengthRange = key((0.3, 0.5), "outer width of the cabinet", unit="m")
-    depth: LengthRange = key((0.143, 0.17), "outer depth of the cabinet", unit="m")
-    board: LengthRange = key((0.004, 0.007), "thickness of floors, back and top", unit="m")
-    wall: LengthRange = key((0.0025, 0.007), "thickness of the side walls", unit="m")
-    shelves: CountRange = key((1, 2), "number of floors, one above the other")
+    width: SizeRange = key((0.3, 0.5), "outer width of the cabinet", unit="m")
+    depth: SizeRange = key((0.143, 0.17), "outer depth of the cabinet", unit="m")
+    board: SizeRange = key((0.004, 0.007), "thickness of floors, back and top", unit="m")
+    wall: SizeRange = key((0.0025, 0.007), "thickness of the side walls", unit="m")
+    shelves: PositiveCountRange = key((1, 2), "number of floors, one above the other")
     top_probability: float = key(0.7, "chance of a board on top", ge=0, le=1)
-    shelf_cans: CountRange = key((2, 3), "height of a shelf in cans; random stacks are no higher")
+    shelf_cans: PositiveCountRange = key((2, 3), "height of a shelf in cans; random stacks are no higher")
     can_pitch: float = key(0.09375, "height of a shelf for each of its cans", unit="m", ge=0.03, le=0.5)
-    can_radius: LengthRange = key((0.026, 0.0325), "radius of a column's lowest can", unit="m")
-    can_height: LengthRange = key((0.05, 0.1), "height of a column's lowest can", unit="m")
+    can_radius: SizeRange = key((0.026, 0.0325), "radius of a column's lowest can", unit="m")
+    can_height: SizeRange = key((0.05, 0.1), "height of a column's lowest can", unit="m")
     same_radius: bool = key(True, "one radius for a shelf, shrunk so that its columns fill the width; else one for a column")
     rows: int = key(0, "rows from front to back; 0: as many as fit", ge=0, le=20)
     row_shift: FactorRange = key((0.0, 0.2), "a single row's distance from mid-depth, either way, as a share of the depth")
@@ -62,8 +63,36 @@ class Params(TabletopConfig):
     scaled_height: ShareRange = key((0.5, 0.95), "its height, as a share (random stacks)")
     scaled_radius: ShareRange = key((0.75, 0.95), "its radius, as a share")
     object_scale: FactorRange = key((0.9, 1.0), "size of the can to place, as a share of one that fills a random slot")
-    min_clearance: float = key(0.003, "a slot counts if it leaves the object this free play sideways", unit="m", ge=0, le=0.1)
-    min_headroom: float = key(0.004, "and this height", unit="m", ge=0.001, le=0.1)
+    min_clearance: float = key(0.002, "a slot counts if it leaves the object this free play sideways", unit="m", ge=0, le=0.1)
+    min_headroom: float = key(0.002, "and this height", unit="m", ge=0.001, le=0.1)
+
+    @model_validator(mode="after")
+    def check_sizes(self) -> Params:
+        """The smallest cabinet has room for the largest can, and the largest one a number of cans that can be handled."""
+        widest = 2 * self.column_pad * self.can_radius[1] + self.column_gap[1]
+        expect_room(self.width[0] - 2 * self.wall[1], widest, "width", "its walls and a column of can_radius")
+        expect_room(
+            self.depth[0] - self.board[1] - 2 * EDGE, 2 * self.can_radius[1], "depth", "its back and a can of can_radius"
+        )
+        height = self.can_pitch * self.shelf_cans[0] - self.board[1] - self.ceiling_gap[1]
+        expect_room(height, self.can_height[0], "can_pitch", "the boards, ceiling_gap and a can of can_height")
+        across, high = 2 * self.can_radius[0], self.can_pitch * self.shelf_cans[1] / self.can_height[0]
+        expect_few(
+            self.width[1] / across * self.depth[1] / across * max(high, 1) * self.shelves[1], "can_radius and can_height"
+        )
+        return self
+
+
+@dataclass(frozen=True)
+class Shelf:
+    """One floor of the cabinet and the room above it, m."""
+
+    width: float  # inner
+    depth: float  # outer
+    back: float  # thickness of the back wall
+    floor: float  # height of the upper face
+    ceiling: float  # height of the board above, or of the walls' ends
+    is_covered: bool  # whether there is a board above
 
 
 @dataclass(frozen=True)
@@ -72,8 +101,7 @@ class Column:
 
     x: float  # m, container frame
     y: float
-    floor: float  # m, height of the shelf's upper face
-    ceiling: float  # m, height at which the shelf ends
+    shelf: Shelf
     cans: tuple[tuple[float, float], ...]  # (radius, height) from bottom to top, m; none: an open column
     removed: tuple[float, float]  # (radius, height) of the can that would fit on top
     is_front: bool  # whether it stands in its shelf's front row
@@ -81,7 +109,7 @@ class Column:
     @property
     def top(self) -> float:
         """Height (m) of the face on which one more can would stand."""
-        return self.floor + sum(height for _, height in self.cans)
+        return self.shelf.floor + sum(height for _, height in self.cans)
 
 
 def sample_scene(params: Params, rng: np.random.Generator) -> Scene | Rejected:
@@ -89,12 +117,12 @@ def sample_scene(params: Params, rng: np.random.Generator) -> Scene | Rejected:
     cans_high, shelves = int(rng.integers(*params.shelf_cans, endpoint=True)), int(rng.integers(*params.shelves, endpoint=True))
     width, depth = rng.uniform(*params.width), rng.uniform(*params.depth)
     board, wall, pitch = rng.uniform(*params.board), rng.uniform(*params.wall), params.can_pitch * cans_high
-    boards = solids.open_shelf(width, depth, pitch, shelves, board, wall, bool(rng.uniform() < params.top_probability))
+    has_top = bool(rng.uniform() < params.top_probability)
+    boards = solids.open_shelf(width, depth, pitch, shelves, board, wall, has_top)
     columns: list[Column] = []
-    for shelf in range(shelves):
-        columns += _fill_shelf(
-            params, (width - 2 * wall, depth, board), shelf * pitch + board, (shelf + 1) * pitch, cans_high, rng
-        )
+    for k in range(shelves):
+        shelf = Shelf(width - 2 * wall, depth, board, k * pitch + board, (k + 1) * pitch, has_top or k < shelves - 1)
+        columns += _fill_shelf(params, shelf, cans_high, rng)
     if params.filling == "full":
         columns = _open_slots(params, columns, rng)
     parts = [*boards, *(can for column in columns for can in _cans(column))]
@@ -102,30 +130,27 @@ def sample_scene(params: Params, rng: np.random.Generator) -> Scene | Rejected:
     return build_scene(params, parts, [cylinder(*size, (0, 0, 0))], candidates, "revolution", rng)
 
 
-def _fill_shelf(
-    params: Params, shelf: tuple[float, float, float], floor: float, ceiling: float, cans_high: int, rng: np.random.Generator
-) -> list[Column]:
-    """The columns of one shelf of (inner width, outer depth, back wall's thickness), m, in rows from front to back."""
-    width, depth, back = shelf
+def _fill_shelf(params: Params, shelf: Shelf, cans_high: int, rng: np.random.Generator) -> list[Column]:
+    """The columns of one shelf, in rows from front to back."""
     radius = rng.uniform(*params.can_radius)
     if params.same_radius:
-        across = np.ceil(width / (2 * params.column_pad * radius + max(params.column_gap)))
-        radius = (width / across - max(params.column_gap)) / (2 * params.column_pad)
+        across = np.ceil(shelf.width / (2 * params.column_pad * radius + max(params.column_gap)))
+        radius = (shelf.width / across - max(params.column_gap)) / (2 * params.column_pad)
     largest = radius if params.same_radius else params.can_radius[1]
     columns: list[Column] = []
-    for row, x in enumerate(_row_positions(params, depth, back, largest, rng)):
-        for y, r in _column_positions(params, width, radius, rng):
-            shift = _single_row_shift(params, depth, back, r, rng) if params.rows == 1 else x
-            stack = _stack(params, r, ceiling - floor, cans_high, rng)
+    for row, row_x in enumerate(_row_positions(params, shelf, largest, rng)):
+        for y, r in _column_positions(params, shelf.width, radius, rng):
+            x = _single_row_shift(params, shelf, r, rng) if params.rows == 1 else row_x
+            stack = _stack(params, r, shelf.ceiling - shelf.floor, cans_high, rng)
             missing = rng.uniform() < params.missing_column
             cans, spare = ((), stack[0]) if missing else (stack, stack[-1])
-            columns.append(Column(shift, y, floor, ceiling, cans, spare, row == 0))
+            columns.append(Column(x, y, shelf, cans, spare, row == 0))
     return columns
 
 
-def _row_positions(params: Params, depth: float, back: float, radius: float, rng: np.random.Generator) -> list[float]:
+def _row_positions(params: Params, shelf: Shelf, radius: float, rng: np.random.Generator) -> list[float]:
     """x (m) of each row of discs, from the front edge to the back wall; what is left of the depth is behind the last."""
-    x, last = depth / 2 - EDGE - radius, -depth / 2 + back + EDGE + radius
+    x, last = shelf.depth / 2 - EDGE - radius, -shelf.depth / 2 + shelf.back + EDGE + radius
     rows: list[float] = []
     while (not rows or x >= last) and len(rows) < (params.rows or np.inf):
         rows.append(x)
@@ -133,10 +158,10 @@ def _row_positions(params: Params, depth: float, back: float, radius: float, rng
     return rows
 
 
-def _single_row_shift(params: Params, depth: float, back: float, radius: float, rng: np.random.Generator) -> float:
+def _single_row_shift(params: Params, shelf: Shelf, radius: float, rng: np.random.Generator) -> float:
     """x (m) of one column of a single row, which need not be straight."""
-    shift = float(rng.choice([-1.0, 1.0]) * rng.uniform(*params.row_shift) * depth)
-    return float(np.clip(shift, -depth / 2 + back + EDGE + radius, depth / 2 - EDGE - radius))
+    shift = float(rng.choice([-1.0, 1.0]) * rng.uniform(*params.row_shift) * shelf.depth)
+    return float(np.clip(shift, -shelf.depth / 2 + shelf.back + EDGE + radius, shelf.depth / 2 - EDGE - radius))
 
 
 def _column_positions(params: Params, width: float, radius: float, rng: np.random.Generator) -> list[tuple[float, float]]:
@@ -206,7 +231,7 @@ def _open_slots(params: Params, columns: Sequence[Column], rng: np.random.Genera
 
 def _cans(column: Column) -> list[Part]:
     """The column's cans as clutter."""
-    parts, z = [], column.floor
+    parts, z = [], column.shelf.floor
     for radius, height in column.cans:
         parts.append(cylinder(radius, height, (column.x, column.y, z + height / 2), CLUTTER))
         z += height
@@ -238,7 +263,9 @@ def _candidate(
 ) -> Candidate | None:
     """The place on top of a column if a can of (radius, height), m, fits there, among parts (kind, size, bounds)."""
     radius, height = size
-    if column.top + height + params.min_headroom > column.ceiling:
+    # Under open sky only its centre must be inside.
+    needed = height + params.min_headroom if column.shelf.is_covered else height / 2 + HOVER
+    if column.top + needed > column.shelf.ceiling:
         return None
     position = (column.x, column.y, column.top + height / 2 + HOVER)
     clearance = solids.free_play(cylinder(radius, height, position), *around)

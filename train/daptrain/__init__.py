@@ -5,13 +5,17 @@ Importing this package imports nothing heavy; PyTorch comes with the first of it
 
 from __future__ import annotations
 
+import sys
 from importlib import import_module
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
+
+from dapdata.errors import require
 
 if TYPE_CHECKING:
     from daptrain.evaluate import evaluate
-    from daptrain.scans import predict
     from daptrain.loop import train
+    from daptrain.scans import predict
 
 __all__ = ["evaluate", "predict", "train"]
 _HOMES = {"evaluate": "evaluate", "predict": "scans", "train": "loop"}
@@ -21,8 +25,20 @@ def __getattr__(name: str) -> Any:
     """Imports a public name when it is first asked for."""
     if name not in __all__:
         raise AttributeError(f"module 'daptrain' has no attribute '{name}'")
+    require("torch", "train")
     return getattr(import_module(f"daptrain.{_HOMES[name]}"), name)
 
 
 def __dir__() -> list[str]:
     return sorted([*globals(), *__all__])
+
+
+class _Package(ModuleType):
+    """Keeps `daptrain.evaluate` the verb: importing the module of the same name would put itself there."""
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if not (name == "evaluate" and isinstance(value, ModuleType)):
+            super().__setattr__(name, value)
+
+
+sys.modules[__name__].__class__ = _Package

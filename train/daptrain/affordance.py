@@ -109,7 +109,7 @@ class AffordanceNet(nn.Module):
         """(B, L, S) estimate of the clean scores in [-1, 1]."""
         out = self(encoded, noisy, t)
         if self.predicts_logits:
-            return 2 * out.sigmoid() - 1
+            return torch.as_tensor(2 * out.sigmoid() - 1)
         return diffusion.clean_from_noise(noisy, self.alpha_bar[t].float()[..., None], out).clamp(-1, 1)
 
 

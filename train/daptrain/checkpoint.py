@@ -48,16 +48,20 @@ class Progress:
     seconds: float = 0.0  # wall clock of all sessions
     best: float = WORST
     best_step: int = 0
+    minutes: float = 0.0  # largest budget of minutes that was used up
 
 
-def describe(task: str, digest: str, recipe: dict[str, Any], config: TrainConfig, method: str, device: str) -> dict[str, Any]:
-    """What config.json says of a run."""
+def describe(
+    data: str, task: str, digest: str, recipe: dict[str, Any], config: TrainConfig, method: str, device: str
+) -> dict[str, Any]:
+    """What config.json says of a run; `data` is where the dataset lay, `dataset` its digest."""
     return {
         "format": FORMAT,
         "task": task,
         "method": method,
         "networks": {name: network.version for name, network in NETS.items()},
         "dataset": digest,
+        "data": data,
         "train": config.model_dump(mode="json"),
         "recipe": recipe,
         "device": device,
@@ -117,9 +121,9 @@ def read_description(run: Path) -> dict[str, Any]:
 
 def save_weights(path: Path, network: Net, task: str) -> None:
     """Writes a network's weights with the task and the network they belong to."""
-    metadata = {"network": network.name, "version": str(network.version), "task": task, "method": network.method}
+    metadata = {"network": network.name, "version": network.version, "task": task, "method": network.method}
     tensors = {key: value.detach().cpu().contiguous() for key, value in network.state_dict().items()}
-    write_whole(path, to_bytes(tensors, metadata))
+    write_whole(path, packed(tensors, metadata))
 
 
 def load_network(run: Path, name: str, description: dict[str, Any], config: TrainConfig, device: torch.device) -> Net:
@@ -133,7 +137,7 @@ def load_network(run: Path, name: str, description: dict[str, Any], config: Trai
         raise CheckpointError(f"{path}: not there; train it first: dapdata train --run {run} --net {name}")
     tensors, metadata = read_tensors(path)
     network = NETS[name](config, description["method"])
-    wanted = {"network": name, "version": str(network.version), "task": description["task"], "method": network.method}
+    wanted = {"network": name, "version": network.version, "task": description["task"], "method": network.method}
     for key, value in wanted.items():
         if metadata.get(key) != value:
             raise CheckpointError(f"{path}: has weights of {key} '{metadata.get(key)}', expected '{value}'; train again")
@@ -164,11 +168,9 @@ def save_state(
     tensors |= {f"average/{key}": value for key, value in average.items()}
     for key, value in network.named_parameters():
         tensors |= {f"optimizer/{key}/{moment}": x for moment, x in optimizer.state[value].items()}
-    metadata = {"network": network.name, "version": str(network.version), "progress": json.dumps(asdict(progress))}
-    write_whole(
-        run / f"{network.name}.state.safetensors",
-        to_bytes({key: value.cpu().contiguous() for key, value in tensors.items()}, metadata),
-    )
+    metadata = {"network": network.name, "version": network.version, "progress": asdict(progress)}
+    content = packed({key: value.cpu().contiguous() for key, value in tensors.items()}, metadata)
+    write_whole(run / f"{network.name}.state.safetensors", content)
 
 
 def load_state(run: Path, network: Net, optimizer: torch.optim.Optimizer, average: dict[str, Tensor]) -> Progress:
@@ -181,10 +183,10 @@ def load_state(run: Path, network: Net, optimizer: torch.optim.Optimizer, averag
     if not path.exists():
         return Progress()
     tensors, metadata = read_tensors(path)
-    if (found := (metadata.get("network"), metadata.get("version"))) != (expected := (network.name, str(network.version))):
+    if (found := (metadata.get("network"), metadata.get("version"))) != (expected := (network.name, network.version)):
         raise CheckpointError(f"{path}: has the state of {found}, expected {expected}; give another folder with --run")
     try:
-        progress = Progress(**json.loads(metadata["progress"]))
+        progress = Progress(**metadata["progress"])
         weights = {key.removeprefix("weights/"): x for key, x in tensors.items() if key.startswith("weights/")}
         load_tensors_into(network, weights, path)
         for key, value in network.named_parameters():
@@ -200,12 +202,27 @@ def load_state(run: Path, network: Net, optimizer: torch.optim.Optimizer, averag
     return progress
 
 
-def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """All arrays and the metadata of a safetensors file."""
+def packed(tensors: dict[str, Tensor], metadata: dict[str, Any]) -> bytes:
+    """A safetensors file, the same bytes for the same content: the format keeps several metadata entries in no order."""
+    return bytes(to_bytes(tensors, {"dapdata": json.dumps(metadata, sort_keys=True)}))
+
+
+def is_spent(run: Path, name: str, steps: int | None, minutes: float | None) -> bool:
+    """Whether a network was trained already with a budget like this or a larger one."""
+    path = run / f"{name}.state.safetensors"
+    if not path.exists() or not (run / f"{name}.last.safetensors").exists():
+        return False
+    progress = Progress(**read_tensors(path)[1].get("progress", {}))
+    return (steps is not None and progress.step >= steps) or (minutes is not None and progress.minutes >= minutes)
+
+
+def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """All arrays and the metadata of a safetensors file that `packed` made."""
     try:
         with safe_open(path, framework="pt") as file:
-            return {key: file.get_tensor(key) for key in file.keys()}, dict(file.metadata() or {})  # noqa: SIM118
-    except (SafetensorError, OSError) as error:
+            metadata = json.loads((file.metadata() or {}).get("dapdata", "{}"))
+            return {key: file.get_tensor(key) for key in file.keys()}, dict(metadata)  # noqa: SIM118
+    except (SafetensorError, OSError, ValueError, TypeError) as error:
         raise CheckpointError(f"{path}: {error}, expected safetensors as `dapdata train` writes them; train again") from error
 
 

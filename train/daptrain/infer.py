@@ -25,7 +25,7 @@ from daptrain.checkpoint import load_network, read_description
 from daptrain.fit import ObjectFit, fit_object
 from daptrain.loop import pick_device
 from daptrain.pose import PoseNet
-from daptrain.prepare import Crop, Inputs, crop, prepare_inputs, region_reach
+from daptrain.prepare import Inputs, crop, prepare_inputs, region_reach
 
 Array = NDArray[Any]
 

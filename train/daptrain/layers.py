@@ -90,7 +90,7 @@ class GroupedVectorAttention(nn.Module):
         # broadcast product and a sum.
         every = (weight.mT @ value).unflatten(-1, (self.groups, -1))  # (B, M, G, G, C/G)
         from_value = every.diagonal(dim1=2, dim2=3).mT  # (B, M, G, C/G)
-        to_out = self.offset_out.weight.unflatten(0, (self.groups, -1))  # (G, C/G, H)
+        to_out = self.offset_out.weight.view(self.groups, -1, bias.shape[-1])  # (G, C/G, H)
         from_bias = torch.einsum("bmgh,gch->bmgc", weight.mT @ bias, to_out)
         return torch.as_tensor((from_value + from_bias).flatten(-2) + self.offset_out.bias)
 

@@ -38,6 +38,7 @@ from daptrain.checkpoint import (
     NetName,
     Progress,
     describe,
+    is_spent,
     load_state,
     save_state,
     save_weights,
@@ -47,6 +48,10 @@ from daptrain.checkpoint import (
 from daptrain.pose import PoseNet
 from daptrain.prepare import Crop, Example, LabelRule, pose_item, prepare, random_turn, reference_rotation
 
+PARTS: dict[NetName, Callable[[TrainConfig], float]] = {  # of the minutes, when both networks are trained
+    "affordance": lambda config: config.affordance_share,
+    "pose": lambda config: 1 - config.affordance_share,
+}
 LOG_EVERY = 20  # steps between lines of metrics.jsonl; checkpoints fall on these steps too
 CHECKPOINT_SECONDS = 20.0
 REPORT_SECONDS = 5.0  # between lines of progress where there is no terminal
@@ -77,6 +82,7 @@ class Budget:
 
     steps: int | None = None
     seconds: float | None = None
+    minutes: float = 0.0  # what the caller asked for, of which these seconds are a part
     before: float = 0.0  # s spent in earlier sessions
     started: float = field(default_factory=time.monotonic)
 
@@ -125,7 +131,16 @@ def train(
     config = config or TrainConfig.model_validate(whole.recipe["train"])
     minutes = config.minutes if minutes is None and steps is None else minutes
     run, where, task = Path(run), pick_device(device), task_name(whole.task)
-    start_run(run, describe(task, whole.digest, whole.recipe, config, method, str(where)))
+    names: list[NetName] = [name for name in PARTS if net in ("both", name)]
+    if not names:
+        raise UsageError(f"net: got '{net}', expected both, affordance or pose")
+    start_run(
+        run, describe(str(dataset), task, whole.digest, whole.recipe, config, method, str(where)) | {"data": str(dataset)}
+    )
+    names = [name for name in names if not is_spent(run, name, steps, minutes)]
+    if not names:
+        say(f"{run}: trained already with this budget; give more --minutes or --steps to go on")
+        return run
     rule = LabelRule(whole.recipe["label"]["eps_place"], whole.recipe["label"]["kind"])
     every_goal = config.model_copy(update={"goals": "all"})  # validation asks whether a sample is any valid goal
     material = Material(
@@ -135,20 +150,14 @@ def train(
         int(whole.recipe["seed"]),
         task,
     )
-    seconds = None if minutes is None else 60 * minutes - (time.monotonic() - started)
-    for name, budget in budgets(net, steps, seconds, config):
+    preparation = time.monotonic() - started
+    for name in names:
+        budget = Budget(steps, minutes=minutes or 0.0)
+        if minutes is not None:
+            part = 1.0 if net != "both" else PARTS[name](config)
+            budget.seconds = part * (60 * minutes - preparation)
         fit(name, material, run, config, method, budget, where)
     return run
-
-
-def budgets(net: str, steps: int | None, seconds: float | None, config: TrainConfig) -> Iterator[tuple[NetName, Budget]]:
-    """Each network to train with its part of the budget; a clock starts when its network is asked for."""
-    if net not in ("both", *NETS):
-        raise UsageError(f"net: got '{net}', expected both, affordance or pose")
-    parts: dict[NetName, float] = {"affordance": config.affordance_share, "pose": 1 - config.affordance_share}
-    for name, part in parts.items():
-        if net in ("both", name):
-            yield name, Budget(steps, None if seconds is None else seconds * (part if net == "both" else 1))
 
 
 def task_name(task: Any) -> str:
@@ -226,7 +235,11 @@ def fit(
             if time.monotonic() - saved > CHECKPOINT_SECONDS:
                 save_state(run, network, optimizer, average, progress)
                 saved = time.monotonic()
+    if progress.step == 0:
+        raise UsageError(f"{run}: the budget was spent before the first step of {name}; give more --minutes")
     save_weights(run / f"{name}.last.safetensors", averaged(network, average), material.task)
+    progress.minutes = max(progress.minutes, budget.minutes)
+    save_state(run, network, optimizer, average, progress)
     draw_curves(run)
     return progress
 

@@ -204,7 +204,7 @@ def reference_rotation(examples: list[Example]) -> Array:
             for e in some
         )
 
-    return rotations[int(np.argmin([spread(R) for R in rotations]))]
+    return np.asarray(rotations[int(np.argmin([spread(R) for R in rotations]))])
 
 
 def box_goal(targets: Targets, T_front_object: Array, reference: Array) -> Array:

@@ -33,10 +33,12 @@ REACH = 0.016  # m: how far the search may shift a candidate sideways
 GRID = 0.002  # m: spacing of the search
 MARGIN = 0.001  # m: free space wanted around the object, so that it ends in the middle of a gap
 FLOOR = 0.005  # m: points this little above the underside are what it stands on, not in its way
+NOISE = 0.002  # m: rank overlooks points that are no deeper than this
 DEPTH_CAP = 0.01  # m: a point further inside counts no more than this
 SHIFT_COST = np.array([10.0, 6.0])  # of 1 cm of shift along x and y, in points that are 1 cm inside; out is the easy way
 SETTLE_DOWN, SETTLE_UP = 0.06, 0.04  # m below and above the underside in which support is looked for
 LEVEL = 0.004  # m: points of one support lie within this of its height
+FOOTPRINTS = (-0.002, 0.01, 0.025)  # m: the footprint is grown by these, one after the other, until support is found
 SUPPORT_POINTS = 3  # fewer points under the footprint are no support
 
 
@@ -127,7 +129,7 @@ def rank(
             centre = T[k, :3, 3]
             cost += 100.0 * float(((centre < scene.container.low) | (centre > scene.container.high)).any())
         if "path" in criteria:
-            path = float(_path_cost(T[k], scene, fit, np.zeros((1, 2)), margin=0.0)[0])
+            path = float(_path_cost(T[k], scene, fit, np.zeros((1, 2)), margin=-NOISE)[0])
             cost += path + 10.0 * (path > 2.0)
         if "support" in criteria:
             missing = SUPPORT_POINTS - min(SUPPORT_POINTS, _support_count(T[k], scene, fit))
@@ -185,32 +187,33 @@ def _square(R: Array) -> Array:
 def _settle(T: Array, scene: ObservedScene, fit: ObjectFit) -> float:
     """How far to move (m, up is positive) so that the underside stands on the points under it; 0 without any.
 
-    Of the levels within reach the one with the most points wins, a near one before a far one of the same size.
+    Of the levels within reach the one with the most points wins, a near one before a far one of the same size. Where
+    the footprint itself was not seen, its surroundings tell the level.
     """
-    height = _support_heights(T, scene, fit)
-    height = height[(height > -SETTLE_DOWN) & (height < SETTLE_UP)]
-    if len(height) < SUPPORT_POINTS:
-        return 0.0
-    near = np.abs(height[:, None] - height[None, :]) <= LEVEL
-    votes = near.sum(axis=1) - 100 * np.abs(height)  # one point is worth 1 cm
-    best = height[np.argmax(votes)]
-    level = height[np.abs(height - best) <= LEVEL]
-    return float(np.median(level)) if len(level) >= SUPPORT_POINTS else 0.0
+    for growth in FOOTPRINTS:
+        height = _support_heights(T, scene, fit, growth)
+        height = height[(height > -SETTLE_DOWN) & (height < SETTLE_UP)]
+        if len(height) >= SUPPORT_POINTS:
+            near = (np.abs(height[:, None] - height[None, :]) <= LEVEL).sum(axis=1)
+            best = int(np.argmax(near - 100 * np.abs(height)))  # one point is worth 1 cm
+            if near[best] >= SUPPORT_POINTS:
+                return float(np.median(height[np.abs(height - height[best]) <= LEVEL]))
+    return 0.0
 
 
-def _support_heights(T: Array, scene: ObservedScene, fit: ObjectFit) -> Array:
-    """Heights above the underside (m) of the upward points under the footprint, edges left out."""
+def _support_heights(T: Array, scene: ObservedScene, fit: ObjectFit, growth: float) -> Array:
+    """Heights above the underside (m) of the upward points under the footprint, grown on each side (m)."""
     half = half_extents(T[:3, :3], fit)
     local = scene.points[scene.up] - T[:3, 3]
     if fit.shape == "cylinder":
-        under = np.hypot(local[:, 0], local[:, 1]) < half[0] - 0.002
+        under = np.hypot(local[:, 0], local[:, 1]) < half[0] + growth
     else:
-        under = (np.abs(local[:, :2]) < half[:2] - 0.002).all(axis=1)
+        under = (np.abs(local[:, :2]) < half[:2] + growth).all(axis=1)
     return np.asarray(local[under, 2] + half[2])
 
 
 def _support_count(T: Array, scene: ObservedScene, fit: ObjectFit) -> int:
-    return int((np.abs(_support_heights(T, scene, fit)) <= 2 * LEVEL).sum())
+    return int((np.abs(_support_heights(T, scene, fit, FOOTPRINTS[0])) <= 2 * LEVEL).sum())
 
 
 def _search(T: Array, scene: ObservedScene, fit: ObjectFit) -> Array:
@@ -227,7 +230,7 @@ def _path_cost(T: Array, scene: ObservedScene, fit: ObjectFit, shifts: Array, ma
     Args:
         T: (4, 4) pose of the fitted object in the front frame.
         shifts: (S, 2) shifts along x and y, m.
-        margin: m by which the object is thought larger sideways and at the back.
+        margin: m by which the object is thought larger on all sides but the underside; negative: smaller.
 
     Returns:
         (S,) sum over the points of how deep they are, 1 for each that is 1 cm deep or more.

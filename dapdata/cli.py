@@ -48,7 +48,10 @@ Overrides = Annotated[list[str] | None, _option("--set", help="Override of a rec
 Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 DryRun = Annotated[bool, typer.Option("--dry-run", help="Only say what would be done, and why.")]
 Fresh = Annotated[bool, typer.Option("--fresh", help="Delete what is there first, instead of going on.")]
-Workers = Annotated[int, typer.Option("--workers", min=1, help="Processes that work at the same time.")]
+Workers = Annotated[
+    int | None,
+    _option("--workers", help="Processes that work at the same time", default="one for each core", min=1, metavar="W"),
+]
 Engine = Annotated[str, typer.Option("--engine", help="Where they work: local, ray or ray://HOST:PORT.")]
 Device = Annotated[str, typer.Option("--device", help="auto, cpu, cuda or cuda:N.")]
 Minutes = Annotated[
@@ -163,7 +166,7 @@ def generate(
     recipe: RecipeFile,
     out: Out = None,
     demos: Demos = None,
-    workers: Workers = 1,
+    workers: Workers = None,
     engine: Engine = "local",
     overrides: Overrides = None,
     dry_run: DryRun = False,
@@ -178,7 +181,13 @@ def generate(
         _need("sim", "pybullet", "numba", "pebble")
     with progress("generate", "demo") as advance:
         made = pipeline.generate(
-            asked, out, workers=workers, engine=engine, fresh=fresh, dry_run=dry_run, progress=None if dry_run else advance
+            asked,
+            out,
+            workers=_count(workers),
+            engine=engine,
+            fresh=fresh,
+            dry_run=dry_run,
+            progress=None if dry_run else advance,
         )
     _show_made(made, as_json)
 
@@ -186,7 +195,7 @@ def generate(
 @app.command(epilog="Example: dapdata label data/can_cabinet --set label.eps_place=0.02")
 def label(
     dataset: LastDataset = None,
-    workers: Workers = 1,
+    workers: Workers = None,
     engine: Engine = "local",
     overrides: Overrides = None,
     dry_run: DryRun = False,
@@ -200,8 +209,15 @@ def label(
         _need("sim", "numba", "pebble")
     with progress("label", "demo") as advance:
         made = pipeline.label(
-            folder, overrides or (), workers=workers, engine=engine, dry_run=dry_run, progress=None if dry_run else advance
+            folder,
+            overrides or (),
+            workers=_count(workers),
+            engine=engine,
+            dry_run=dry_run,
+            progress=None if dry_run else advance,
         )
+    if isinstance(made, Path):
+        _draw_previews(made)
     _show_made(made, as_json)
 
 
@@ -311,7 +327,7 @@ def evaluate(
     ] = None,
     k: K = None,
     device: Device = "auto",
-    workers: Workers = 1,
+    workers: Workers = None,
     out: Annotated[Path | None, _option("--out", help="Folder to write", default="the run", metavar="DIR")] = None,
     as_json: Json = False,
 ) -> None:
@@ -327,7 +343,16 @@ def evaluate(
     elif data is None:
         data = last("dataset", None)
     report = evaluate_run(
-        run, data, split=split, trials=trials, protocol=protocol, method=method, k=k, device=device, workers=workers, out=out
+        run,
+        data,
+        split=split,
+        trials=trials,
+        protocol=protocol,
+        method=method,
+        k=k,
+        device=device,
+        workers=_count(workers),
+        out=out,
     )
     if run is not None:
         remember(run=run)
@@ -342,13 +367,13 @@ def judge(
     trials: Annotated[int | None, _option("--trials", help="Demos of the split that are judged", default="all", min=1)] = None,
     protocol: Annotated[Protocol, typer.Option("--protocol", help="Rules of the judge.")] = "strict",
     out: JsonFile = None,
-    workers: Workers = 1,
+    workers: Workers = None,
     as_json: Json = False,
 ) -> None:
     """Judge anyone's placements, from a file. It sees no model; the method saw no goals."""
     from dapdata.metrics import judge_file
 
-    report = judge_file(predictions, data, protocol, split=split, trials=trials, workers=workers, progress=say)
+    report = judge_file(predictions, data, protocol, split=split, trials=trials, workers=_count(workers), progress=say)
     if out is not None:
         out.write_text(json.dumps(report, indent=1), encoding="utf-8")
     _show_report(report, as_json)
@@ -406,7 +431,7 @@ def run(
     minutes: Minutes = None,
     trials: Trials = None,
     k: K = None,
-    workers: Workers = 1,
+    workers: Workers = None,
     engine: Engine = "local",
     device: Device = "auto",
     overrides: Overrides = None,
@@ -423,16 +448,17 @@ def run(
 
     asked = _recipe(recipe, overrides, demos)
     with progress("generate", "demo") as advance:
-        dataset = _folder(pipeline.generate(asked, out, workers=workers, engine=engine, fresh=fresh, progress=advance))
+        dataset = _folder(pipeline.generate(asked, out, workers=_count(workers), engine=engine, fresh=fresh, progress=advance))
     with progress("label", "demo") as advance:
-        pipeline.label(dataset, workers=workers, engine=engine, progress=advance)
+        pipeline.label(dataset, workers=_count(workers), engine=engine, progress=advance)
+    _draw_previews(dataset)
     remember(dataset=dataset)
     target = run_folder or Path("runs") / dataset.resolve().name
     if fresh and (target / "config.json").is_file():
         shutil.rmtree(target)
     train_networks(dataset, target, minutes=minutes, device=device, config=asked.train)
     remember(run=target)
-    report = evaluate_run(target, dataset, trials=trials, k=k, device=device, workers=workers)
+    report = evaluate_run(target, dataset, trials=trials, k=k, device=device, workers=_count(workers))
     files = {"dataset": dataset, "run": target, "report": target / "report.html"} | _leave_behind(dataset, target)
     made = {name: str(path) for name, path in files.items()}
     show({**made, "result": report}, as_json, made_text(report, made))
@@ -473,6 +499,20 @@ def _recipe(path: Path, overrides: list[str] | None, demos: int | None) -> Any:
     from dapdata.recipe import load
 
     return load(path, [*(overrides or ()), *([f"demos={demos}"] if demos is not None else [])])
+
+
+def _count(workers: int | None) -> int:
+    """How many processes: as many as asked for, or one for each core that this process may use."""
+    return workers or len(os.sched_getaffinity(0))
+
+
+def _draw_previews(dataset: Path) -> None:
+    """Adds the pictures of the dataset's card, unless they are there already."""
+    from dapdata import manifest, pipeline
+    from dapdata.show import preview
+
+    if not any(path.startswith(f"{manifest.PREVIEWS}/") for path in manifest.read(dataset).files):
+        pipeline.attach(dataset, preview(dataset))
 
 
 def _show_made(made: Any, as_json: bool) -> None:

@@ -57,7 +57,7 @@ def _cluster(made: Inputs, sections: Sections, draw: Draw) -> Superpoints | Reje
 
 def _label(made: Inputs, sections: Sections, draw: Draw) -> Labels:
     """What the two networks learn."""
-    from dapdata.label import label
+    from dapdata.labels import label
 
     return label(made["demonstrate"], made["observe"], made["cluster"], sections["label"])
 

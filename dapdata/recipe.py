@@ -20,7 +20,7 @@ from dapdata import keys, tasks
 from dapdata.cluster import SuperpointsConfig
 from dapdata.config import EvalConfig, SceneConfig, Section, SplitConfig, TrainConfig, key
 from dapdata.errors import UsageError, nearest
-from dapdata.label import LabelConfig
+from dapdata.labels import LabelConfig
 from dapdata.observe import CamerasConfig, NoiseConfig
 from dapdata.simulate import PlacementConfig
 from dapdata.strict_yaml import Location, Source

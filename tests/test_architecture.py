@@ -23,7 +23,7 @@ LINES = (
     ("solids", "meshes", "keys", "slic", "split", "matching"),
     ("tabletop",),
     ("tasks",),
-    ("simulate", "observe", "cluster", "label"),
+    ("simulate", "observe", "cluster", "labels"),
     ("recipe", "store", "stages", "engines", "manifest", "card", "report", "predictions"),
     ("plan", "units"),
     ("pipeline",),
@@ -35,7 +35,7 @@ LINES = (
     ("__main__",),
 )
 LINE = {module: number for number, modules in enumerate(LINES) for module in modules}
-DOMAIN = frozenset(("solids", "meshes", "tabletop", "tasks", "simulate", "observe", "cluster", "label"))
+DOMAIN = frozenset(("solids", "meshes", "tabletop", "tasks", "simulate", "observe", "cluster", "labels"))
 MUST_NOT_KNOW = {
     **dict.fromkeys(("store", "stages", "engines", "manifest"), DOMAIN),
     **dict.fromkeys(("loading", "metrics", "card", "show"), frozenset(("pipeline", "engines", "tasks"))),
@@ -66,7 +66,7 @@ def tree_of(path: Path) -> ast.Module:
 
 
 def module_of(path: Path) -> str:
-    """`label` for dapdata/label.py, `tasks` for dapdata/tasks/can_cabinet.py, `daptrain` for all of train/daptrain."""
+    """`labels` for dapdata/labels.py, `tasks` for dapdata/tasks/can_cabinet.py, `daptrain` for all of train/daptrain."""
     if ROOT / "train" in path.parents:
         return "daptrain"
     inside = path.relative_to(ROOT / "dapdata")

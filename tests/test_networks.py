@@ -73,7 +73,7 @@ def test_demonstrated_goals_only_when_asked():
 
 @pytest.mark.parametrize("kind", ["hard", "soft"])
 def test_affordance_of_other_goals_is_the_labels_own_rule(kind):
-    from dapdata.label import affordance as stored_rule
+    from dapdata.labels import affordance as stored_rule
 
     sample, rule = make_sample(0), prepare.LabelRule(0.03, kind)
     local = poses.transform(poses.inverse(sample["pose/T_world_object_start"]), sample["object/points"].astype(float))

@@ -5,20 +5,18 @@ Importing this package imports nothing heavy; PyTorch comes with the first of it
 
 from __future__ import annotations
 
-import sys
 from importlib import import_module
-from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from dapdata.errors import require
 
 if TYPE_CHECKING:
-    from daptrain.evaluate import evaluate
+    from daptrain.evaluation import evaluate
     from daptrain.loop import train
     from daptrain.scans import predict
 
 __all__ = ["evaluate", "predict", "train"]
-_HOMES = {"evaluate": "evaluate", "predict": "scans", "train": "loop"}
+_HOMES = {"evaluate": "evaluation", "predict": "scans", "train": "loop"}
 
 
 def __getattr__(name: str) -> Any:
@@ -31,14 +29,3 @@ def __getattr__(name: str) -> Any:
 
 def __dir__() -> list[str]:
     return sorted([*globals(), *__all__])
-
-
-class _Package(ModuleType):
-    """Keeps `daptrain.evaluate` the verb: importing the module of the same name would put itself there."""
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        if not (name == "evaluate" and isinstance(value, ModuleType)):
-            super().__setattr__(name, value)
-
-
-sys.modules[__name__].__class__ = _Package

@@ -189,8 +189,11 @@ def load_state(run: Path, network: Net, optimizer: torch.optim.Optimizer, averag
         progress = Progress(**metadata["progress"])
         weights = {key.removeprefix("weights/"): x for key, x in tensors.items() if key.startswith("weights/")}
         load_tensors_into(network, weights, path)
+        has_moments = any(key.startswith("optimizer/") for key in tensors)  # none before the first step that counted
         for key, value in network.named_parameters():
             average[key].copy_(tensors[f"average/{key}"])
+            if not has_moments:
+                continue
             optimizer.state[value] = {
                 moment: tensors[f"optimizer/{key}/{moment}"].to("cpu" if moment == "step" else value.device)
                 for moment in ("step", "exp_avg", "exp_avg_sq")

@@ -130,7 +130,7 @@ def train(
     whole, train_split, val_split = (open_dataset(dataset, split=split) for split in (None, "train", "val"))
     config = config or TrainConfig.model_validate(whole.recipe["train"])
     minutes = config.minutes if minutes is None and steps is None else minutes
-    run, where, task = Path(run), pick_device(device), task_name(whole.task)
+    run, where, task = Path(run), pick_device(device), whole.task
     names: list[NetName] = [name for name in PARTS if net in ("both", name)]
     if not names:
         raise UsageError(f"net: got '{net}', expected both, affordance or pose")
@@ -158,11 +158,6 @@ def train(
             budget.seconds = part * (60 * minutes - preparation)
         fit(name, material, run, config, method, budget, where)
     return run
-
-
-def task_name(task: Any) -> str:
-    """One word for the task or tasks of a dataset."""
-    return task if isinstance(task, str) else "+".join(task)
 
 
 def pick_device(device: str) -> torch.device:

@@ -17,7 +17,7 @@ from dapdata.records import Placement
 from dapdata.report import Report
 from daptrain import baselines
 from daptrain.baselines.random import interior
-from daptrain.evaluate import evaluate
+from daptrain.evaluation import evaluate
 
 
 def quiet(line: str) -> None:

@@ -14,7 +14,7 @@ from shelf_scene import shelf_demo
 
 from dapdata import rng
 from dapdata.cluster import SuperpointsConfig, cluster
-from dapdata.label import LabelConfig, affordance, correspondence, distance_to_object, label, near_object
+from dapdata.labels import LabelConfig, affordance, correspondence, distance_to_object, label, near_object
 from dapdata.observe import CamerasConfig, NoiseConfig, observe
 from dapdata.poses import inverse, pose, rotation_about, transform
 from dapdata.records import Cloud, Superpoints
@@ -163,6 +163,6 @@ def test_values_out_of_range_are_refused(bad):
 
 
 def test_labelling_needs_no_simulator_and_no_kernels():
-    code = "import sys, dapdata.label; print(sorted({'pybullet', 'numba', 'scipy', 'torch'} & set(sys.modules)))"
+    code = "import sys, dapdata.labels; print(sorted({'pybullet', 'numba', 'scipy', 'torch'} & set(sys.modules)))"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert out.stdout.strip() == "[]"

@@ -91,7 +91,8 @@ def run_app(arguments: Sequence[str]) -> int:
         return _fail(str(error), error.exit_code)
     except CLICK_ERROR as error:
         message = error.format_message().rstrip(".")  # type: ignore[attr-defined]
-        return _fail(f"{message}; see `dapdata {' '.join(arguments[:1])} --help`", 2)
+        command = "" if message.startswith("No such command") else f"{' '.join(arguments[:1])} "
+        return _fail(f"{message}; see `dapdata {command}--help`", 2)
     except (KeyboardInterrupt, typer.Abort):
         return _fail(STOPPED, INTERRUPTED)
     except BrokenPipeError:  # whoever reads our output (head, less) has seen enough

@@ -90,7 +90,12 @@ class TrainConfig(Section):
         "default", "`paper`: eps prediction of one goal per demo, no refinement, ranking by collision count, as published"
     )
     minutes: float = key(30.0, "wall-clock budget of both networks together", unit="min", gt=0, le=100_000)
-    affordance_share: float = key(0.6, "share of the minutes that net 1 gets", gt=0, lt=1)
+    affordance_share: float = key(
+        0.5,
+        "share of the minutes that net 1 gets where the networks are trained one after the other (GPU, single core)",
+        gt=0,
+        lt=1,
+    )
     goals: Literal["all", "demonstrated"] = key("all", "`all`: every valid goal is a target, not only the demonstrated one")
     yaw: Literal["front", "any"] = key(
         "front", "`front`: containers are turned to face one way, by fitted geometry; `any`: trained at every yaw instead"

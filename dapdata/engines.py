@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from dapdata import errors
-from dapdata.errors import DapdataError, UsageError, nearest, require
+from dapdata.errors import DapdataError, UsageError, hint, require
 
 RETRIES = 2  # after which a job is given up
 RESTARTS = 3  # of a pool that broke without a job being to blame
@@ -77,7 +77,7 @@ def get(name: str) -> Engine:
     """
     known: dict[str, type[Engine]] = {"local": Local, "inline": Inline}
     if name not in known:
-        raise UsageError(f"engine: got '{name}', expected one of {', '.join(known)}; {nearest(name, list(known))}")
+        raise UsageError(f"engine: got '{name}', expected one of {', '.join(known)}{hint(name, list(known))}")
     return known[name]()
 
 

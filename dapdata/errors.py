@@ -92,5 +92,10 @@ def require(module: str, extra: str) -> ModuleType:
 
 def nearest(name: str, known: list[str]) -> str:
     """A hint such as "did you mean 'eps_place'?", or the list of known names."""
+    return hint(name, known).removeprefix("; ") or f"known: {', '.join(sorted(known))}"
+
+
+def hint(name: str, known: list[str]) -> str:
+    """ "; did you mean 'eps_place'?", or nothing where no known name is near: for messages that list them already."""
     close = get_close_matches(name, known, n=1, cutoff=0.5)
-    return f"did you mean '{close[0]}'?" if close else f"known: {', '.join(sorted(known))}"
+    return f"; did you mean '{close[0]}'?" if close else ""

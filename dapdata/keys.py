@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from math import inf, isfinite, log, pi
 from typing import Any
 
-from dapdata.errors import nearest
+from dapdata.errors import hint, nearest
 from dapdata.strict_yaml import Location, dotted
 
 Schema = dict[str, Any]
@@ -115,8 +115,7 @@ def shown(value: Any) -> str:
 def meant(value: Any, schema: Schema) -> str:
     """`; did you mean 0.03?` where a value is a near miss: millimetres for metres, a misspelt option. Else ""."""
     if isinstance(value, str):
-        hint = nearest(value, [str(option) for option in schema.get("enum", [])])
-        return f"; {hint}" if hint.startswith("did") else ""
+        return hint(value, [str(option) for option in schema.get("enum", [])])
     number = isinstance(value, int | float) and not isinstance(value, bool) and isfinite(value)
     if not number or schema.get("type") not in ("integer", "number"):
         return ""

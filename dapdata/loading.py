@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dapdata import manifest, rng, store
-from dapdata.errors import CorruptionError, FormatError, UsageError, nearest, require
+from dapdata.errors import CorruptionError, FormatError, UsageError, hint, nearest, require
 from dapdata.manifest import Manifest
 from dapdata.records import Array
 from dapdata.split import SPLITS
@@ -46,7 +46,7 @@ def open(root: str | Path, split: str | None = None) -> Dataset:
         raise FormatError(f"{folder}: generated but not labelled, expected shards; run `dapdata label {folder}`")
     known = list(found.splits)
     if split is not None and split not in known:
-        raise UsageError(f"split: got '{split}', expected one of {', '.join(SPLITS)}; {nearest(split, known)}")
+        raise UsageError(f"split: got '{split}', expected one of {', '.join(SPLITS)}{hint(split, list(SPLITS))}")
     index = manifest.read_index(folder)
     if len(index["demo"]) != sum(shard.demos for shard in found.shards):
         raise CorruptionError(f"{folder}: index.parquet and manifest.json name different demos; run `dapdata verify {folder}`")

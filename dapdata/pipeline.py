@@ -199,8 +199,18 @@ class _Command:
                 progress_file = {"recipe": self.resolved, "specs": self.specs, "stages": list(self.wanted)}
                 durable.replace_file(self.root / manifest.PROGRESS, durable.canonical(progress_file))
                 shutil.rmtree(self.root / QUARANTINE, ignore_errors=True)
-                self._work(found, jobs, workers, progress)
-            units.publish(self.layout, self.stages, self.resolved, self.recipe.split, self.units)
+                try:
+                    self._work(found, jobs, workers, progress)
+                except UsageError:
+                    _leave_nothing(self.root)
+                    raise
+            now = units.publish(self.layout, self.stages, self.resolved, self.recipe.split, self.units)
+        if sum(now.rejects.demos.values()) >= now.demos:
+            reasons = ", ".join(f"{reason} {count}" for reason, count in now.rejects.demos.items())
+            raise UsageError(
+                f"{self.root}: all {now.demos} demos were rejected ({reasons}), expected some that are not; "
+                "change cameras, noise or superpoints in the recipe"
+            )
         return self.root
 
     def _jobs(self, needed: int) -> dict[str, Unit]:
@@ -290,6 +300,12 @@ def _clear(root: Path) -> None:
     for folder in ("shards", "stages", QUARANTINE):
         if (root / folder).is_dir():
             durable.discard(root, root / folder)
+
+
+def _leave_nothing(root: Path) -> None:
+    """Removes a folder in which no unit was finished: a recipe that admits no demo leaves no trace."""
+    if not any(path.name != ".lock" and path.name != manifest.PROGRESS for path in root.iterdir()):
+        shutil.rmtree(root)
 
 
 def replay(path: str) -> None:

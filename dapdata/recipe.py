@@ -19,7 +19,7 @@ from pydantic import BaseModel, Field, SerializeAsAny, ValidationError, create_m
 from dapdata import keys, tasks
 from dapdata.cluster import SuperpointsConfig
 from dapdata.config import EvalConfig, SceneConfig, Section, SplitConfig, TrainConfig, key
-from dapdata.errors import UsageError, nearest
+from dapdata.errors import UsageError, hint
 from dapdata.labels import LabelConfig
 from dapdata.observe import CamerasConfig, NoiseConfig
 from dapdata.simulate import PlacementConfig
@@ -171,7 +171,7 @@ def starter(task: str) -> str:
         UsageError: for a task that does not exist.
     """
     if task not in tasks.names():
-        raise UsageError(f"task: got '{task}', expected one of {', '.join(tasks.names())}; {nearest(task, tasks.names())}")
+        raise UsageError(f"task: got '{task}', expected one of {', '.join(tasks.names())}{hint(task, tasks.names())}")
     model = recipe_class(task)
     header = [
         f"# {summary(task)}",

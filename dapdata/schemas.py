@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from dapdata.errors import UsageError, nearest
+from dapdata.errors import UsageError, hint
 from dapdata.records import columns, is_ragged
 
 KINDS = ("recipe", "manifest", "shard", "report")
@@ -36,7 +36,7 @@ def schema(kind: str) -> dict[str, Any]:
         return report_schema()
     if kind == "shard":
         return shard_schema()
-    raise UsageError(f"schema: got '{kind}', expected one of {', '.join(KINDS)}; {nearest(kind, list(KINDS))}")
+    raise UsageError(f"schema: got '{kind}', expected one of {', '.join(KINDS)}{hint(kind, list(KINDS))}")
 
 
 def shard_schema() -> dict[str, Any]:

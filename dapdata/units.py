@@ -275,7 +275,7 @@ def publish(
         content_sha256=_content(records, layout.shard_stage),
         recipe=dict(recipe),
         recipe_sha256=durable.digest(recipe),
-        shards=shards,
+        shards=shards if rows else [],
         splits=_splits(rows),
         rejects=_rejects(records),
         stages=_stage_entries(layout, entries),

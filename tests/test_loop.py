@@ -79,6 +79,32 @@ def test_a_run_that_was_stopped_and_resumed_ends_with_the_same_bits(material, tm
     assert metrics(whole, "loss") == metrics(parts, "loss")
 
 
+def budgets(steps):
+    return {name: loop.Budget(steps=steps) for name in ("affordance", "pose")}
+
+
+def test_side_by_side_gives_the_bits_of_one_after_the_other(material, tmp_path):
+    for workers in (1, 2):
+        (tmp_path / str(workers)).mkdir()
+        loop.fit_all(budgets(4), material, tmp_path / str(workers), TINY, "dap", CPU, workers)
+    for name in ("affordance.last.safetensors", "pose.last.safetensors"):
+        assert (tmp_path / "1" / name).read_bytes() == (tmp_path / "2" / name).read_bytes()
+
+
+def test_when_one_network_fails_the_other_saves_and_stops(material, tmp_path, monkeypatch):
+    step = loop.train_step
+
+    def fails(network, *rest):
+        if network.name == "pose":
+            raise RuntimeError("no more memory")
+        return step(network, *rest)
+
+    monkeypatch.setattr(loop, "train_step", fails)
+    with pytest.raises(RuntimeError, match="no more memory"):
+        loop.fit_all(budgets(10_000), material, tmp_path, TINY, "dap", CPU, 2)
+    assert 0 < checkpoint.load_state(tmp_path, *fresh("affordance", material)).step < 10_000
+
+
 def fresh(name, material):
     network = loop.build(name, TINY, "dap", material)
     average = {key: value.detach().clone() for key, value in network.named_parameters()}
@@ -132,8 +158,9 @@ def test_a_run_leaves_weights_metrics_and_curves(material, tmp_path):
     trained(material, tmp_path, "affordance", 3)
     names = {path.name for path in tmp_path.iterdir()}
     assert names == {
-        "affordance.safetensors", "affordance.last.safetensors", "affordance.state.safetensors", "metrics.jsonl", "curves.png"
+        "affordance.safetensors", "affordance.last.safetensors", "affordance.state.safetensors", "metrics.jsonl"
     }  # fmt: skip
+    loop.draw_curves(tmp_path)
     assert (tmp_path / "curves.png").read_bytes().startswith(b"\x89PNG")
 
 

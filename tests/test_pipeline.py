@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -142,13 +143,24 @@ def test_shards_take_upstream_files_as_they_are(toy: Path) -> None:
 def test_a_demo_that_never_comes_about_is_an_error_that_names_the_rejects(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    never = (
-        toy_stages.STAGES[0].__class__(**{**vars(toy_stages.STAGES[0]), "run": lambda *_: toy_stages.Rejected("no_free_slot")}),
-    )
-    monkeypatch.setattr(toy_stages, "STAGES", never + toy_stages.STAGES[1:])
+    never = replace(toy_stages.STAGES[0], run=lambda *_: toy_stages.Rejected("no_free_slot"))
+    monkeypatch.setattr(toy_stages, "STAGES", (never, *toy_stages.STAGES[1:]))
     with pytest.raises(UsageError, match=r"toy: no demo 0 after 50 attempts \(no_free_slot 50\).*widen"):
         pipeline.generate(toy_recipe(), tmp_path / "toy", engine="inline", table=TABLE)
-    assert not (tmp_path / "toy/manifest.json").exists()
+    assert not (tmp_path / "toy").exists(), "a recipe that admits no demo leaves no trace"
+
+
+def test_a_dataset_whose_demos_are_all_rejected_is_an_error_that_names_the_rejects(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    blind = replace(toy_stages.STAGES[1], run=lambda *_: toy_stages.Rejected("too_few_object_points"))
+    monkeypatch.setattr(toy_stages, "STAGES", (toy_stages.STAGES[0], blind, *toy_stages.STAGES[2:]))
+    with pytest.raises(UsageError, match=r"all 6 demos were rejected \(too_few_object_points 6\).*change cameras"):
+        pipeline.generate(toy_recipe(), tmp_path / "toy", engine="inline", table=TABLE)
+    with pytest.raises(UsageError, match="all 6 demos were rejected"):
+        pipeline.label(tmp_path / "toy", engine="inline", table=TABLE)
+    assert health.verify(tmp_path / "toy").ok
+    assert manifest.read(tmp_path / "toy").shards == []
 
 
 def test_labelling_refuses_what_it_cannot_change(toy: Path) -> None:

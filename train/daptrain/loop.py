@@ -4,6 +4,9 @@ All randomness of step i comes from `rng.stream(seed, "train/<net>", i)`, so no 
 their average, AdamW's moments and the number of the step are the whole state. A run of N steps that is killed and
 resumed ends with the same bits on CPU as one that is not.
 
+On CPU the two networks are trained side by side, a thread each: their tensors are so small that sharing one tensor's
+work among cores gains little, and costs a factor of several when another program wants one of the cores.
+
 With a budget of minutes the learning rate follows the clock instead of the step, so that the schedule ends in time
 on any machine; such a run resumes too, but no two of them are alike.
 """
@@ -15,8 +18,10 @@ import json
 import math
 import os
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -52,6 +57,7 @@ PARTS: dict[NetName, Callable[[TrainConfig], float]] = {  # of the minutes, when
     "affordance": lambda config: config.affordance_share,
     "pose": lambda config: 1 - config.affordance_share,
 }
+SHARED = threading.Lock()  # torch's own generator and metrics.jsonl are used by one thread at a time
 LOG_EVERY = 20  # steps between lines of metrics.jsonl; checkpoints fall on these steps too
 CHECKPOINT_SECONDS = 20.0
 REPORT_SECONDS = 5.0  # between lines of progress where there is no terminal
@@ -150,18 +156,48 @@ def train(
         int(whole.recipe["seed"]),
         task,
     )
-    preparation = time.monotonic() - started
+    seconds = None if minutes is None else 60 * minutes - (time.monotonic() - started)
+    side_by_side = where.type == "cpu" and len(names) > 1 and cores() > 1
+    asked = {}
     for name in names:
-        budget = Budget(steps, minutes=minutes or 0.0)
-        if minutes is not None:
-            part = 1.0 if net != "both" else PARTS[name](config)
-            budget.seconds = part * (60 * minutes - preparation)
-        fit(name, material, run, config, method, budget, where)
+        part = 1.0 if side_by_side or net != "both" else PARTS[name](config)
+        asked[name] = Budget(steps, None if seconds is None else part * seconds, minutes or 0.0)
+    fit_all(asked, material, run, config, method, where, workers=len(names) if side_by_side else 1)
+    draw_curves(run)
     return run
 
 
+def fit_all(
+    budgets: dict[NetName, Budget],
+    material: Material,
+    run: Path,
+    config: TrainConfig,
+    method: Method,
+    device: torch.device,
+    workers: int = 1,
+) -> None:
+    """Trains several networks, `workers` at a time. When one of them fails, or on Ctrl-C, the others save and stop."""
+    stop = threading.Event()
+    with ThreadPoolExecutor(workers) as pool:
+        waiting = [
+            pool.submit(fit, name, material, run, config, method, budget, device, stop) for name, budget in budgets.items()
+        ]
+        try:
+            for done in as_completed(waiting):
+                done.result()
+        except BaseException:
+            stop.set()
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+
+
+def cores() -> int:
+    """How many cores this process may use."""
+    return len(os.sched_getaffinity(0))
+
+
 def pick_device(device: str) -> torch.device:
-    """The device to compute on; "auto" takes a GPU if there is one. On CPU all cores that we may use are used."""
+    """The device to compute on; "auto" takes a GPU if there is one. On CPU a network gets half of the cores, at most 4."""
     if device == "auto":
         device = "cuda" if torch.cuda.is_available() else "cpu"
     try:
@@ -170,7 +206,7 @@ def pick_device(device: str) -> torch.device:
     except (RuntimeError, AssertionError) as error:
         raise UsageError(f"device: got '{device}', expected auto, cpu or a GPU such as cuda:0 ({error})") from error
     if where.type == "cpu" and "OMP_NUM_THREADS" not in os.environ:
-        torch.set_num_threads(len(os.sched_getaffinity(0)))
+        torch.set_num_threads(min(4, max(1, cores() // 2)))
     return where
 
 
@@ -183,7 +219,14 @@ def prepared(samples: Any, count: int, rule: LabelRule, config: TrainConfig) -> 
 
 
 def fit(
-    name: NetName, material: Material, run: Path, config: TrainConfig, method: Method, budget: Budget, device: torch.device
+    name: NetName,
+    material: Material,
+    run: Path,
+    config: TrainConfig,
+    method: Method,
+    budget: Budget,
+    device: torch.device,
+    stop: threading.Event | None = None,
 ) -> Progress:
     """Trains one network until its budget is spent, from where the run folder left it.
 
@@ -193,8 +236,9 @@ def fit(
         run: Run folder; exists.
         config: Sizes and optimiser.
         method: "dap" or "cap".
-        budget: When to stop.
+        budget: When to stop; its clock starts now.
         device: Where to compute.
+        stop: Save and return early when this is set.
     """
     if not any((example.targets.affordance > 0).any() for example in material.train):
         raise UsageError(f"{run}: no demo of the train split has a container point near its goal; generate more demos")
@@ -202,7 +246,7 @@ def fit(
     optimizer = torch.optim.AdamW(network.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay)
     average = {key: value.detach().clone() for key, value in network.named_parameters()}
     progress = load_state(run, network, optimizer, average)
-    budget.before = progress.seconds
+    budget.before, budget.started = progress.seconds, time.monotonic()
     keep_metrics(run, name, progress.step)
     logged: list[dict[str, float]] = []
     saved = time.monotonic()
@@ -214,6 +258,9 @@ def fit(
             update_average(average, network, min(config.ema, 1 - 1 / (1 + AVERAGED_SHARE * progress.step)))
             progress.seconds = budget.spent()
             last = budget.share(progress.step) >= 1
+            if stop is not None and stop.is_set():
+                save_state(run, network, optimizer, average, progress)
+                return progress
             if not (progress.step % LOG_EVERY == 0 or last):
                 continue
             means = {key: float(np.mean([entry[key] for entry in logged])) for key in logged[-1]}
@@ -235,13 +282,12 @@ def fit(
     save_weights(run / f"{name}.last.safetensors", averaged(network, average), material.task)
     progress.minutes = max(progress.minutes, budget.minutes)
     save_state(run, network, optimizer, average, progress)
-    draw_curves(run)
     return progress
 
 
 def build(name: NetName, config: TrainConfig, method: Method, material: Material) -> Net:
     """A new network; its first weights follow from the seed."""
-    with torch.random.fork_rng(devices=[]):
+    with SHARED, torch.random.fork_rng(devices=[]):
         torch.manual_seed(int(random.stream(material.seed, f"train/{name}/weights", 0).integers(2**62)))
         network = NETS[name](config, method)
     if isinstance(network, PoseNet):
@@ -444,7 +490,7 @@ def reported(items: range, name: str) -> Iterator[int]:
 
 
 @contextmanager
-def progress_bar(name: str, budget: Budget) -> Iterator[Callable[[int, dict[str, float]], None]]:
+def progress_bar(name: NetName, budget: Budget) -> Iterator[Callable[[int, dict[str, float]], None]]:
     """A function to show (step, figures) with: a bar on a terminal, a line every few seconds elsewhere."""
     from tqdm import tqdm
 
@@ -469,7 +515,7 @@ def progress_bar(name: str, budget: Budget) -> Iterator[Callable[[int, dict[str,
 
 def log(run: Path, entry: dict[str, Any]) -> None:
     """Appends a line to metrics.jsonl."""
-    with (run / "metrics.jsonl").open("a") as file:
+    with SHARED, (run / "metrics.jsonl").open("a") as file:
         file.write(json.dumps(entry) + "\n")
 
 
@@ -482,8 +528,9 @@ def read_metrics(run: Path) -> list[dict[str, Any]]:
 
 def keep_metrics(run: Path, name: str, step: int) -> None:
     """Drops the entries of a network that come after a step: resuming writes them again."""
-    entries = [e for e in read_metrics(run) if e["net"] != name or e["step"] <= step]
-    write_whole(run / "metrics.jsonl", "".join(json.dumps(e) + "\n" for e in entries).encode())
+    with SHARED:
+        entries = [e for e in read_metrics(run) if e["net"] != name or e["step"] <= step]
+        write_whole(run / "metrics.jsonl", "".join(json.dumps(e) + "\n" for e in entries).encode())
 
 
 def draw_curves(run: Path) -> None:

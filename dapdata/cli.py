@@ -21,7 +21,18 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from dapdata.console import comparison_text, last, made_text, placements_text, progress, remember, report_text, say, show
+from dapdata.console import (
+    comparison_text,
+    last,
+    made_text,
+    placements_text,
+    progress,
+    remember,
+    report_text,
+    say,
+    seldom,
+    show,
+)
 from dapdata.errors import DapdataError, UsageError, require
 
 CLICK_ERROR: type[Exception] = typer.BadParameter.__mro__[2]  # ClickException, of all bad arguments; not exported
@@ -52,7 +63,9 @@ Workers = Annotated[
     int | None,
     _option("--workers", help="Processes that work at the same time", default="one for each core", min=1, metavar="W"),
 ]
-Engine = Annotated[str, typer.Option("--engine", help="Where they work: local, ray or ray://HOST:PORT.")]
+Engine = Annotated[
+    str, typer.Option("--engine", help="Where they work: local, or inline: in this process, one after the other.")
+]
 Device = Annotated[str, typer.Option("--device", help="auto, cpu, cuda or cuda:N.")]
 Minutes = Annotated[
     float | None, _option("--minutes", help="Wall-clock budget of training", default="the recipe's", metavar="M")
@@ -91,6 +104,8 @@ def run_app(arguments: Sequence[str]) -> int:
         return _fail(str(error), error.exit_code)
     except CLICK_ERROR as error:
         message = error.format_message().rstrip(".")  # type: ignore[attr-defined]
+        if not arguments:  # the message is the help
+            return _fail(message, 2)
         command = "" if message.startswith("No such command") else f"{' '.join(arguments[:1])} "
         return _fail(f"{message}; see `dapdata {command}--help`", 2)
     except (KeyboardInterrupt, typer.Abort):
@@ -178,8 +193,6 @@ def generate(
     from dapdata import pipeline
 
     asked = _recipe(recipe, overrides, demos)
-    if not dry_run:
-        _need("sim", "pybullet", "numba", "pebble")
     with progress("generate", "demo") as advance:
         made = pipeline.generate(
             asked,
@@ -206,8 +219,6 @@ def label(
     from dapdata import pipeline
 
     folder = last("dataset", dataset)
-    if not dry_run:
-        _need("sim", "numba", "pebble")
     with progress("label", "demo") as advance:
         made = pipeline.label(
             folder,
@@ -374,7 +385,9 @@ def judge(
     """Judge anyone's placements, from a file. It sees no model; the method saw no goals."""
     from dapdata.metrics import judge_file
 
-    report = judge_file(predictions, data, protocol, split=split, trials=trials, workers=_count(workers), progress=say)
+    if out is not None:  # before the work, so that it is not lost
+        out.parent.mkdir(parents=True, exist_ok=True)
+    report = judge_file(predictions, data, protocol, split=split, trials=trials, workers=_count(workers), progress=seldom(say))
     if out is not None:
         out.write_text(json.dumps(report, indent=1), encoding="utf-8")
     _show_report(report, as_json)
@@ -419,6 +432,7 @@ def predict(
     ]
     found = {"run": str(run), "container": str(container), "object": str(thing), "placements": rows}
     if out is not None:
+        out.parent.mkdir(parents=True, exist_ok=True)
         out.write_text(json.dumps(found, indent=1), encoding="utf-8")
     show(found, as_json, placements_text(rows))
 
@@ -446,7 +460,9 @@ def run(
     _need("train", "torch")
     from daptrain import evaluate as evaluate_run
     from daptrain import train as train_networks
+    from daptrain.loop import check_budget
 
+    check_budget(minutes, None)
     asked = _recipe(recipe, overrides, demos)
     with progress("generate", "demo") as advance:
         dataset = _folder(pipeline.generate(asked, out, workers=_count(workers), engine=engine, fresh=fresh, progress=advance))

@@ -22,6 +22,19 @@ def say(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
 
+def seldom(speak: Callable[[str], None]) -> Callable[[str], None]:
+    """The same, but with at most a line every few seconds."""
+    last = -EVERY
+
+    def now_and_then(line: str) -> None:
+        nonlocal last
+        if time.monotonic() - last >= EVERY:
+            last = time.monotonic()
+            speak(line)
+
+    return now_and_then
+
+
 def show(result: Mapping[str, Any], as_json: bool, text: str) -> None:
     """The result of a command, on stdout."""
     print(json.dumps(result, indent=1, default=str) if as_json else text, flush=True)

@@ -111,6 +111,9 @@ class Inline:
 class Local:
     """A pool of processes on this machine."""
 
+    def __init__(self) -> None:
+        require("pebble", "sim")
+
     def run(self, call: str, jobs: Sequence[Job], *, workers: int, on_done: OnDone) -> list[Failure]:
         """See Engine."""
         tries = dict.fromkeys(range(len(jobs)), 0)

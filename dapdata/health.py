@@ -17,6 +17,7 @@ from dapdata.errors import CorruptionError, FormatError
 from dapdata.manifest import Manifest, UnitEntry
 from dapdata.records import Array
 from dapdata.split import SPLITS
+from dapdata.stages import Layout, units
 
 OWN_FILES = (manifest.MANIFEST, manifest.PROGRESS, manifest.LOG, ".lock")  # of the machinery, not of the data
 OWN_FOLDERS = (durable.STAGING, "stages", "shards", "quarantine", manifest.PREVIEWS)
@@ -251,7 +252,7 @@ def status(root: str | Path) -> Facts:
         "root": str(root),
         "published": published,
         "working": durable.holder(root),
-        "in_progress": _in_progress(root, log),
+        "in_progress": _in_progress(root),
         "quarantined": sorted(path.name for path in root.glob("quarantine/*.json")),
         "cpu_seconds": _cpu_seconds(log),
         "peak_mb": max((line["peak_mb"] for line in log), default=None),
@@ -278,15 +279,16 @@ def _cpu_seconds(log: list[dict[str, Any]]) -> dict[str, float]:
     return total
 
 
-def _in_progress(root: Path, log: list[dict[str, Any]]) -> dict[str, Any] | None:
-    """What the running or interrupted command is at."""
-    path = root / manifest.PROGRESS
-    if not path.is_file():
+def _in_progress(root: Path) -> dict[str, Any] | None:
+    """What the running or interrupted command is at: how many of its units are there."""
+    try:
+        left = json.loads((root / manifest.PROGRESS).read_bytes())
+        demos, seed, shard_size = (left["recipe"][name] for name in ("demos", "seed", "shard_size"))
+        layout, todo = Layout(root, left["specs"], seed, shard_size, left["shard_stage"]), units(demos, shard_size)
+        done = {name: sum(store.is_committed(layout.folder(name, unit)) for unit in todo) for name in left["stages"]}
+    except (OSError, ValueError, KeyError, TypeError):  # nothing is in progress, or what it left is no help
         return None
-    left = json.loads(path.read_bytes())
-    units = -(-left["recipe"]["demos"] // left["recipe"]["shard_size"])
-    done = {name: len({tuple(line["unit"]) for line in log if line["stage"] == name}) for name in left["stages"]}
-    return {"demos": left["recipe"]["demos"], "units": units, "done": done}
+    return {"demos": demos, "units": len(todo), "done": done}
 
 
 def inspect(root: str | Path) -> Facts:

@@ -67,8 +67,8 @@ class Dataset:
 
     root: Path
     split: str | None
-    manifest: Manifest
-    index: Mapping[str, Array]  # columns of index.parquet, for these demos
+    manifest: Manifest = field(repr=False)
+    index: Mapping[str, Array] = field(repr=False)  # columns of index.parquet, for these demos
     _held: dict[str, Block] = field(default_factory=dict, repr=False)
 
     @property
@@ -138,8 +138,9 @@ class Dataset:
         """An iterable dataset of {path: tensor} from disk, a few shards in memory at a time.
 
         Ranks and DataLoader workers get parts that don't overlap and together are everything. Each pass is shuffled
-        anew. `state_dict()` and `load_state_dict()` go on in the middle of a pass (with worker processes: use
-        torchdata's StatefulDataLoader, which asks every worker).
+        anew; with worker processes call `set_epoch(n)` before each, because theirs know of no earlier one.
+        `state_dict()` and `load_state_dict()` go on in the middle of a pass (with worker processes: use torchdata's
+        StatefulDataLoader, which asks every worker).
 
         Args:
             shuffle: Whether to mix: shards at random, and demos among `BLOCKS_HELD` of them.

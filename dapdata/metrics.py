@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from dapdata import __version__
 from dapdata import rng as rngs
 from dapdata.errors import CorruptionError, UsageError
 from dapdata.matching import (
@@ -85,7 +86,8 @@ def wilson(successes: float, number: int) -> tuple[float, float]:
     z, p = 1.959963984540054, successes / number
     centre, spread = p + z * z / (2 * number), z * sqrt(max(p * (1 - p) / number + z * z / (4 * number**2), 0.0))
     scale = 1 + z * z / number
-    return max(0.0, (centre - spread) / scale), min(1.0, (centre + spread) / scale)
+    low, high = (centre - spread) / scale, (centre + spread) / scale
+    return 0.0 if successes == 0 else max(0.0, low), 1.0 if successes == number else min(1.0, high)  # the ends exactly
 
 
 def bootstrap(values: Array, draws: int = 2000) -> tuple[float, float]:
@@ -359,7 +361,7 @@ def judge_dataset(
     """The report on predictions and what it was made from: the oracle first, then the references, then the method.
 
     Args:
-        predictions: Candidates of the scenes; scenes without any are failures.
+        predictions: Candidates for scenes of the split; judged scenes without any are failures.
         dataset: The opened split.
         protocol: "strict" or "rpdiff".
         split: Name of the split.
@@ -378,7 +380,7 @@ def judge_dataset(
         progress: Called with a line now and then.
 
     Raises:
-        UsageError: predictions for demos that are not among the scenes, or a split without scenes.
+        UsageError: predictions for demos that are not in the split, or a split without scenes.
     """
     from dapdata import recipe as recipes
 
@@ -386,7 +388,7 @@ def judge_dataset(
     if number == 0:
         raise UsageError(f"{dataset.root}: split '{split}': got 0 demos, expected at least 1; choose another split")
     samples = [dataset[i] for i in range(number)]
-    _check_demos(predictions, samples, split, origin)
+    _check_demos(predictions, dataset, split, origin)
     k = k or int(predictions.rank.max(initial=0)) + 1
     placement = recipes.from_resolved(dataset.recipe).placement
     sources = {"oracle": oracle(samples, k), **(references or {})}
@@ -414,7 +416,7 @@ def judge_dataset(
         judge=Judge(
             protocol=protocol,
             engine=_engine(),
-            dapdata=_version(),
+            dapdata=__version__,
             placement=placement.model_dump(mode="json"),
             oracle=oracle_rate,
             sound=oracle_rate.value >= SOUND,
@@ -443,11 +445,11 @@ def require_sound(report: Report) -> None:
         )
 
 
-def _check_demos(predictions: Predictions, samples: Sequence[Sample], split: str, origin: str) -> None:
-    known = {int(sample["meta/demo"]) for sample in samples}
+def _check_demos(predictions: Predictions, dataset: Dataset, split: str, origin: str) -> None:
+    known = set(dataset.index["demo"].tolist())
     if unknown := sorted(set(predictions.demo.tolist()) - known):
         raise UsageError(
-            f"{origin}: demo: got {unknown[:5]}{' ...' if len(unknown) > 5 else ''}, expected demos of the {len(known)} judged "
+            f"{origin}: demo: got {unknown[:5]}{' ...' if len(unknown) > 5 else ''}, expected demos of the {len(known)} "
             f"scenes of split '{split}'; predict for that split"
         )
 
@@ -520,15 +522,6 @@ def _engine() -> str:
     from importlib.metadata import version
 
     return f"pybullet {version('pybullet')}"
-
-
-def _version() -> str:
-    from importlib.metadata import PackageNotFoundError, version
-
-    try:
-        return version("dapdata")
-    except PackageNotFoundError:  # run from a checkout that was not installed
-        return "unknown"
 
 
 def _processor() -> str:

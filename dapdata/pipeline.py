@@ -13,15 +13,16 @@ from __future__ import annotations
 import json
 import shutil
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 from dapdata import durable, engines, manifest, recipe, tasks, units
 from dapdata.engines import Failure, Job
-from dapdata.errors import EnvironmentProblem, FormatError, QuarantineError, UsageError
+from dapdata.errors import EnvironmentProblem, FormatError, QuarantineError, UsageError, require
 from dapdata.plan import Before, Cost, Plan, before, make_plan, measured_cost, missing
 from dapdata.recipe import Recipe
 from dapdata.records import Cloud, Demo, Labels, Rejected, Superpoints
@@ -189,6 +190,7 @@ class _Command:
 
     def run(self, workers: int, engine: str, fresh: bool, progress: Progress | None) -> Path:
         """Makes the missing units and publishes what is there then."""
+        _check_packages(stage for stage in self.stages if stage.name in self.wanted)
         found, needed = engines.get(engine), int(self.plan(fresh).gigabytes * 1e9)
         _check_space(self.root, needed)
         with durable.disk_problems(self.root, needed), durable.lock(self.root):
@@ -196,8 +198,13 @@ class _Command:
                 _clear(self.root)
             jobs = self._jobs(needed)
             if jobs:
-                progress_file = {"recipe": self.resolved, "specs": self.specs, "stages": list(self.wanted)}
-                durable.replace_file(self.root / manifest.PROGRESS, durable.canonical(progress_file))
+                left = {
+                    "recipe": self.resolved,
+                    "specs": self.specs,
+                    "stages": self.wanted,
+                    "shard_stage": self.layout.shard_stage,
+                }
+                durable.replace_file(self.root / manifest.PROGRESS, json.dumps(left).encode())  # specs stay in their order
                 shutil.rmtree(self.root / QUARANTINE, ignore_errors=True)
                 try:
                     self._work(found, jobs, workers, progress)
@@ -280,6 +287,13 @@ def _check_folder(root: Path) -> None:
         raise FormatError(f"{root}: a file, expected a folder for the dataset; choose another with --out")
     if root.is_dir() and any(root.iterdir()) and not any((root / name).exists() for name in ours):
         raise FormatError(f"{root}: a folder with other files and no dataset; choose an empty or new one with --out")
+
+
+def _check_packages(stages: Iterable[Stage]) -> None:
+    """Raises a MissingExtraError before anything is written if a stage needs a package that is not installed."""
+    for package in (package for stage in stages for package in stage.packages):
+        if find_spec(package) is None:
+            require(package, "sim")
 
 
 def _check_space(root: Path, needed: int) -> None:

@@ -53,6 +53,12 @@ def printed(capsys: pytest.CaptureFixture[str], *arguments: object) -> Any:
 # Help ------------------------------------------------------------------------------------------------------
 
 
+def test_without_a_command_the_help_is_shown(capsys: pytest.CaptureFixture[str]) -> None:
+    run(capsys, code=2)
+    assert said().startswith("Usage: dapdata")
+    assert said().endswith("Start with: dapdata run recipes/quickstart.yaml\n")
+
+
 @pytest.mark.parametrize("name", COMMANDS)
 def test_every_command_has_help_with_an_example(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     text = run(capsys, name, "--help")
@@ -119,6 +125,12 @@ def test_a_bad_recipe_starts_no_work(command: list[str], capsys: pytest.CaptureF
     assert [path.name for path in tmp_path.iterdir()] == ["x.yaml"]
 
 
+def test_a_bad_budget_starts_no_work_either(capsys: pytest.CaptureFixture[str], tiny_recipe: Path, tmp_path: Path) -> None:
+    run(capsys, "run", tiny_recipe, "--minutes", "-1", code=2)
+    assert said() == "minutes: got -1.0, expected a number above 0\n"
+    assert not any(tmp_path.iterdir())
+
+
 def test_a_missing_extra_is_one_line_that_names_the_command_to_run(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -152,6 +164,10 @@ from dapdata import cli
 assert len(dapdata.open(sys.argv[1], "train")[0]["container/points"]) > 100
 assert [cli.run_app([name, sys.argv[1]]) for name in ("inspect", "verify", "status")] == [0, 0, 0]
 assert [cli.run_app(["generate", sys.argv[2], *more]) for more in (["--dry-run"], [])] == [0, 6]
+try:
+    dapdata.generate(sys.argv[2])
+except dapdata.MissingExtraError as error:
+    assert "pybullet" in str(error), error
 """
 
 
@@ -263,6 +279,8 @@ def test_judge_and_compare_anyones_predictions(tiny_dataset: Path, capsys: pytes
     write_oracle(tiny_dataset, tmp_path / "mine.npz")
     report = printed(capsys, "judge", "mine.npz", "--data", tiny_dataset, "--out", "a.json")
     assert report == json.loads((tmp_path / "a.json").read_text())
+    run(capsys, "judge", "mine.npz", "--data", tiny_dataset, "--out", "new/folder/a.json")
+    assert report["success"] == json.loads((tmp_path / "new/folder/a.json").read_text())["success"]
     assert report["success"]["success_top1"]["value"] == 1
     assert "success_top1      100.0 %" in run(capsys, "judge", "mine.npz", "--data", tiny_dataset)
     assert printed(capsys, "compare", "a.json", "a.json")["difference"] == 0

@@ -6,6 +6,7 @@ import os
 import re
 import runpy
 import shlex
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -155,3 +156,18 @@ assert about["task"] == "jar_shelf" and about["demos_in_shards"] == 3, about
 assert about["per_demo"]["goals"]["max"] == 3, about
 """
     subprocess.run([sys.executable, "-c", script], cwd=tmp_path, check=True, env=os.environ | {"OMP_NUM_THREADS": "1"})
+
+
+def test_the_task_of_the_documentation_passes_the_tests_of_every_task(tmp_path: Path) -> None:
+    for name in ("dapdata", "recipes", "tests", "schemas", "pyproject.toml"):
+        source = ROOT / name
+        if source.is_dir():
+            shutil.copytree(source, tmp_path / name, ignore=shutil.ignore_patterns("__pycache__"))
+        else:
+            shutil.copy(source, tmp_path)
+    (tmp_path / "dapdata/tasks/jar_shelf.py").write_text(*blocks(ADD_A_TASK, "python"))
+    (tmp_path / "recipes/jar_shelf.yaml").write_text(*blocks(ADD_A_TASK, "yaml"))
+    command = [sys.executable, "-m", "pytest", "tests/test_tasks.py", "tests/test_recipe.py", "-k", "jar_shelf"]
+    environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(tmp_path)}
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout

@@ -148,6 +148,8 @@ def test_the_preset_of_the_paper_predicts_too(tmp_path):
         (lambda c: (*c[:2], c[2][:0], c[3][:0]), "object cloud: got 0 points"),
         (lambda c: (c[0], c[1][:-1], *c[2:]), "expected both"),
         (lambda c: (c[0] * np.nan, *c[1:]), "NaN"),
+        (lambda c: (1000 * c[0], *c[1:]), "container cloud: is .* m across, expected at most 10 m"),
+        (lambda c: (*c[:2], 1000 * c[2], c[3]), "object cloud: is .* millimetres"),
     ],
 )
 def test_clouds_that_are_none_are_refused(predictor, change, says):

@@ -52,6 +52,10 @@ def test_a_dataset_knows_where_it_comes_from(toy: Path) -> None:
     assert data.digest == json.loads((toy / "manifest.json").read_text())["content_sha256"]
 
 
+def test_a_dataset_is_shown_in_one_line(toy: Path) -> None:
+    assert repr(loading.open(toy, "train")) == f"Dataset(root={toy!r}, split='train')"
+
+
 def test_torch_gives_the_same_arrays(toy: Path) -> None:
     data = dapdata.open(toy)
     tensors = data.torch()

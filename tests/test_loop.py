@@ -140,9 +140,17 @@ def test_minutes_end_the_training_in_time(material, tmp_path):
     assert rates[-1] < 0.1 * max(rates)
 
 
-def test_a_budget_that_allows_no_step_is_an_error_that_says_so(material, tmp_path):
-    with pytest.raises(UsageError, match="give more --minutes"):
-        loop.fit("pose", material, tmp_path, TINY, "dap", loop.Budget(seconds=0.0), CPU)
+@pytest.mark.parametrize("seconds", [0.0, -3.0])
+def test_a_budget_that_preparation_used_up_still_makes_one_step(material, tmp_path, seconds):
+    assert loop.fit("pose", material, tmp_path, TINY, "dap", loop.Budget(seconds=seconds), CPU).step == 1
+    assert {"pose.safetensors", "pose.last.safetensors"} <= {path.name for path in tmp_path.iterdir()}
+
+
+@pytest.mark.parametrize("budget", [{"minutes": 0}, {"minutes": -1}, {"minutes": np.nan}, {"minutes": np.inf}, {"steps": 0}])
+def test_a_budget_that_is_none_is_refused_before_anything_is_written(tiny_dataset, tmp_path, budget):
+    with pytest.raises(UsageError, match=f"{next(iter(budget))}: got"):
+        loop.train(tiny_dataset, tmp_path / "run", **budget)
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_budget_is_known_to_be_spent(material, tmp_path):

@@ -63,6 +63,10 @@ def test_wilson_holds_its_rate_and_stays_in_range(number: int, data: st.DataObje
     assert successes / number - 1e-12 <= high <= 1 + 1e-12
 
 
+def test_wilson_reaches_the_ends_exactly() -> None:
+    assert all(metrics.wilson(0, number)[0] == 0 and metrics.wilson(number, number)[1] == 1 for number in range(1, 200))
+
+
 def test_bootstrap_is_repeatable_and_about_as_wide_as_the_standard_error() -> None:
     values = np.random.default_rng(0).random(400)
     low, high = metrics.bootstrap(values)
@@ -341,6 +345,13 @@ def test_predictions_for_unknown_demos_are_refused(tiny: Path, tmp_path: Path) -
     path = predictions.write(tmp_path / "p.npz", predictions.collect({10**6: [Placement(np.eye(4), 0.0, "ok")]}))
     with pytest.raises(UsageError, match="1000000"):
         metrics.judge_file(path, loading.open(tiny), trials=2)
+
+
+def test_predictions_for_a_whole_split_are_judged_on_its_first_scenes_too(tiny: Path, tmp_path: Path) -> None:
+    opened = loading.open(tiny)
+    path = predictions.write(tmp_path / "p.npz", metrics.oracle([opened[i] for i in range(len(opened))], 1))
+    report = metrics.judge_file(path, opened, trials=2)
+    assert report["split"]["n_scenes"] == report["method"]["n_candidates"] == 2
 
 
 def test_two_processes_judge_as_one(tiny: Path) -> None:

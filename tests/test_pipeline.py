@@ -215,6 +215,19 @@ def test_status_and_inspect_tell_what_is_there(toy: Path) -> None:
     assert inside["per_demo"]["superpoints"]["mean"] == 12.0
 
 
+def test_status_counts_the_units_that_are_there_and_not_those_of_other_settings(
+    toy_copy: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("TOY_FAULT", "nan:4")
+    changed = toy_stages.toy_recipe(8, 3, noise={"preset": "kinect"})
+    with pytest.raises(Exception, match="a stage that failed"):
+        pipeline.generate(changed, toy_copy, engine="inline", table="toy_stages")
+    (toy_copy / "log.jsonl").unlink()  # whoever is killed writes no log
+    assert health.status(toy_copy).to_dict()["in_progress"]["done"] == {"demonstrate": 3, "observe": 1}
+    (toy_copy / "progress.json").write_text("{")
+    assert health.status(toy_copy).to_dict()["in_progress"] is None
+
+
 def test_status_says_who_works(toy_copy: Path) -> None:
     assert health.status(toy_copy).to_dict()["working"] is None
     with durable.lock(toy_copy):

@@ -262,7 +262,7 @@ def _seconds(values: Sequence[float]) -> Quantiles:
 
 
 def _training_minutes(path: Path) -> float | None:
-    """Wall clock of all networks of a run, from its log; None when there is none."""
+    """Minutes that the networks of a run took, added up, from its log; None when there is none."""
     spent: dict[str, float] = {}
     try:
         for line in path.read_text().splitlines():

@@ -30,6 +30,7 @@ from daptrain.prepare import Inputs, crop, prepare_inputs, region_reach
 Array = NDArray[Any]
 
 SMALLEST_CLOUD = 20  # points: no frame can be fitted to fewer
+WIDEST_CLOUD = 10.0  # m: no furniture is wider, but a scan in millimetres is
 
 
 @dataclass(frozen=True)
@@ -201,3 +202,8 @@ def check_cloud(name: str, points: Array, normals: Array) -> None:
         raise UsageError(f"{name} cloud: got {len(points)} points, expected at least {SMALLEST_CLOUD}; is it in sight?")
     if not (np.isfinite(points).all() and np.isfinite(normals).all()):
         raise UsageError(f"{name} cloud: has NaN or infinite numbers, expected finite metres; remove those points")
+    if (width := float(np.ptp(points, axis=0).max())) > WIDEST_CLOUD:
+        raise UsageError(
+            f"{name} cloud: is {width:.0f} m across, expected at most {WIDEST_CLOUD:.0f} m; points are in metres, "
+            "are these millimetres?"
+        )

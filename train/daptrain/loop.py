@@ -128,13 +128,14 @@ def train(
 
     Raises:
         CheckpointError: the run folder holds a run on other data or with another config.
-        UsageError: no demo to train on, a bad device.
+        UsageError: no demo to train on, a bad device, a budget that is none.
     """
     from dapdata.loading import open as open_dataset
 
     started = time.monotonic()
     whole, train_split, val_split = (open_dataset(dataset, split=split) for split in (None, "train", "val"))
     config = config or TrainConfig.model_validate(whole.recipe["train"])
+    check_budget(minutes, steps)
     minutes = config.minutes if minutes is None and steps is None else minutes
     run, where, task = Path(run), pick_device(device), whole.task
     names: list[NetName] = [name for name in PARTS if net in ("both", name)]
@@ -191,6 +192,14 @@ def fit_all(
             raise
 
 
+def check_budget(minutes: float | None, steps: int | None) -> None:
+    """Refuses a budget that is none; None is no limit of that kind."""
+    if minutes is not None and not 0 < minutes < math.inf:
+        raise UsageError(f"minutes: got {minutes}, expected a number above 0")
+    if steps is not None and steps < 1:
+        raise UsageError(f"steps: got {steps}, expected at least 1")
+
+
 def cores() -> int:
     """How many cores this process may use."""
     return len(os.sched_getaffinity(0))
@@ -228,7 +237,7 @@ def fit(
     device: torch.device,
     stop: threading.Event | None = None,
 ) -> Progress:
-    """Trains one network until its budget is spent, from where the run folder left it.
+    """Trains one network until its budget is spent, but for one step at least, from where the run folder left it.
 
     Args:
         name: Which network.
@@ -251,7 +260,7 @@ def fit(
     logged: list[dict[str, float]] = []
     saved = time.monotonic()
     with progress_bar(name, budget) as show:
-        while (share := budget.share(progress.step)) < 1:
+        while (share := budget.share(progress.step)) < 1 or progress.step == 0:
             rate = learning_rate(config, progress.step, share)
             logged.append(train_step(network, optimizer, material, config, progress.step, rate, device))
             progress.step += 1
@@ -277,8 +286,6 @@ def fit(
             if time.monotonic() - saved > CHECKPOINT_SECONDS:
                 save_state(run, network, optimizer, average, progress)
                 saved = time.monotonic()
-    if progress.step == 0:
-        raise UsageError(f"{run}: the budget was spent before the first step of {name}; give more --minutes")
     save_weights(run / f"{name}.last.safetensors", averaged(network, average), material.task)
     progress.minutes = max(progress.minutes, budget.minutes)
     save_state(run, network, optimizer, average, progress)

@@ -44,7 +44,7 @@ STYLE = """
 :root { color-scheme: light; --ink: #1d2433; --soft: #5c6577; --line: #dfe3ea; --pale: #f5f7fa;
         --mine: #d95f02; --other: #8fa3bf; --good: #009e73; }
 * { box-sizing: border-box; }
-body { margin: 0 auto; max-width: 1120px; padding: 28px 24px 60px; background: #fff; color: var(--ink);
+body { margin: 0 auto; max-width: 1240px; padding: 28px 24px 60px; background: #fff; color: var(--ink);
        font: 15px/1.5 system-ui, "Segoe UI", Helvetica, Arial, sans-serif; }
 h1 { font-size: 26px; margin: 0 0 2px; } h2 { font-size: 18px; margin: 36px 0 10px; }
 p, figcaption { color: var(--soft); margin: 4px 0 12px; max-width: 80ch; }
@@ -136,7 +136,7 @@ def _percent(interval: Interval) -> str:
 def _number(value: float | None) -> str:
     if value is None:
         return "-"
-    return "0" if abs(value) < 1e-3 else f"{value:.3g}" if abs(value) < 1000 else f"{value:,.0f}"
+    return "0" if abs(value) < 1e-3 else f"{value:.2g}" if abs(value) < 10 else f"{value:,.0f}"
 
 
 def _spread(q: Quantiles | None) -> str:
@@ -187,7 +187,7 @@ def _cost_table(report: Report) -> str:
         ["physics, s a placement", _spread(cost.physics_s)],
         ["parameters", "-" if cost.parameters is None else f"{cost.parameters:,}"],
         ["demonstrations used", "-" if cost.demos_used is None else f"{cost.demos_used:,}"],
-        ["training, min", _number(cost.training_minutes)],
+        ["training, min, both networks added up", _number(cost.training_minutes)],
         ["device", escape(cost.device or "-")],
         ["machine", escape(report.hardware)],
     ]

@@ -394,10 +394,22 @@ def _is_supported(contacts: Sequence[_Contact]) -> bool:
 # ---------------------------------------------------------------- PyBullet
 
 
+def _import_quietly() -> Any:
+    """PyBullet, which prints when it was built to file descriptor 2 as it is imported."""
+    own, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, 2)
+        return require("pybullet", "sim")
+    finally:
+        os.dup2(own, 2)
+        os.close(own)
+        os.close(nowhere)
+
+
 @cache
 def _client(process: int) -> tuple[Any, int]:
     """The simulator and the number of this process's own connection to it; a forked child makes its own."""
-    bullet = require("pybullet", "sim")
+    bullet = _import_quietly()
     client: int = bullet.connect(bullet.DIRECT)
     if client < 0:
         raise UsageError(f"pybullet: process {process} got no connection, expected one; close others of this process")

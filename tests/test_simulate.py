@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from dataclasses import fields, replace
 
 import numpy as np
@@ -457,3 +459,9 @@ def test_recorded_goals_pass_the_strict_judge(task):
                 assert symmetric_distance(verdict.T_world_object_end, goal, kind, axis)[0] < 1e-3
     assert len(verdicts) > 30
     assert all(verdict.success for verdict in verdicts)
+
+
+def test_the_simulator_says_nothing_when_it_is_loaded() -> None:
+    code = "from dapdata.simulate import _client; _client(0)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert (done.stdout, done.stderr) == ("", "")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -9,7 +11,18 @@ from hypothesis import strategies as st
 
 from dapdata.poses import angle_between, inverse, nearest_symmetric, pose, random_rotation, rotation_about, transform
 from daptrain.fit import ObjectFit, fit_container, fit_object, fit_opening, fit_yaw
-from daptrain.refine import CRITERIA, STEPS, observed_scene, rank, rank_collision_count, refine
+from daptrain.refine import (
+    CRITERIA,
+    DEPTH_CAP,
+    FLOOR,
+    ROOM,
+    STEPS,
+    ObservedScene,
+    observed_scene,
+    rank,
+    rank_collision_count,
+    refine,
+)
 
 Z = np.array([0.0, 0.0, 1.0])
 BOOK = np.array([0.035, 0.17, 0.23])  # m, thickness, depth, height
@@ -106,6 +119,24 @@ def test_a_noisy_partial_cloud_gives_shape_pose_and_size(shape: str, degrees: fl
     assert max(turned) < degrees
     assert np.median(sized) < millimetres
     assert np.median(placed) < millimetres
+
+
+def test_a_can_whose_cap_is_hardly_seen_keeps_its_height() -> None:
+    rng = np.random.default_rng(0)
+    points, normals = can_cloud(CAN, 900, rng)
+    top, bottom = normals[:, 2] > 0.7, normals[:, 2] < -0.7
+    keep = ~bottom & (~top | (np.cumsum(top) <= 14))  # too few to be a face among the points that the fit starts with
+    fit = fit_object(*noisy(points[keep], normals[keep], rng))
+    assert fit.shape == "cylinder"
+    assert fit.size == pytest.approx(CAN, abs=0.003)
+
+
+def test_a_dense_cloud_and_a_tenth_of_it_give_the_same_fit() -> None:
+    for cloud, size in ((box_cloud, BOOK), (can_cloud, CAN)):
+        points, normals = noisy(*cloud(size, 9000, np.random.default_rng(1)), np.random.default_rng(2))
+        dense, sparse = fit_object(points, normals), fit_object(points[::10], normals[::10])
+        assert dense.shape == sparse.shape
+        assert dense.size == pytest.approx(sparse.size, abs=1e-3)
 
 
 def test_axes_of_a_box_are_sorted_by_extent_and_right_handed() -> None:
@@ -222,6 +253,30 @@ def test_a_can_settles_onto_the_floor_whatever_its_turn() -> None:
     assert end[2, 3] == pytest.approx(0.05, abs=0.003)
 
 
+def test_an_object_settles_where_it_is_free_and_not_through_what_it_stands_on() -> None:
+    """A plinth that holds two fifths of the footprint, 3 cm above a floor of which the rest is seen."""
+    rng = np.random.default_rng(3)
+    pieces = [
+        box_cloud(np.array([0.3, 0.4, 0.01]), 3000, rng, (0, 0, -0.005)),
+        box_cloud(np.array([0.01, 0.4, 0.3]), 3000, rng, (-0.15, 0, 0.15)),
+        box_cloud(np.array([0.08, 0.04, 0.03]), 300, rng, (0, 0, 0.015)),
+    ]
+    points, normals = (np.concatenate(part) for part in zip(*pieces))
+    seen = (normals @ [1.0, 0.0, 0.7] > -0.1) & (np.abs(points[:, 0]) < 0.147) & (points[:, 2] > -0.003)
+    scene = observed_scene(points[seen], normals[seen])
+    box = ObjectFit("box", np.eye(4), np.array([0.08, 0.1, 0.12]), 0.0, 0.0, 1.0, 6)
+    end = refine(pose(translation=(0, 0, 0.03 + 0.06 - 0.018))[None], scene, box, ["settle"])[0]
+    assert end[2, 3] == pytest.approx(0.09, abs=0.002)
+
+
+def test_the_search_ends_in_the_middle_of_a_gap() -> None:
+    points, normals, T_world_container = shelf(0.3)
+    truth, book = at_gap(T_world_container), exact_book()
+    off = np.stack([truth @ pose(translation=(shift, 0, 0)) for shift in (-0.012, -0.006, 0.006, 0.012)])
+    found = inverse(truth) @ refine(off, observed_scene(points, normals), book, ["search"])
+    assert np.abs(found[:, 0, 3]).max() < 0.003
+
+
 # Ranking ---------------------------------------------------------------------------------------------------
 
 
@@ -245,6 +300,61 @@ def test_a_free_place_behind_something_is_worse_than_one_that_can_be_reached() -
     )
     good = at_gap(T_world_container)[None]
     assert rank(good, blocked, exact_book())[0] < rank(good, observed_scene(points, normals), exact_book())[0] - 5
+
+
+def test_flying_pixels_in_a_gap_are_no_obstacle_and_a_board_is() -> None:
+    points, normals, T_world_container = shelf(0.7)
+    rng, good = np.random.default_rng(0), at_gap(T_world_container)[None]
+    clear = rank(good, observed_scene(points, normals), exact_book(), criteria=["path"])[0]
+    scores = {}
+    for name, low, high in (
+        ("pixels", (-0.09, -0.02, 0.03), (0.09, 0.02, 0.24)),
+        ("board", (0.05, -0.02, 0.03), (0.06, 0.02, 0.2)),
+    ):
+        number = 12 if name == "pixels" else 150
+        more = transform(T_world_container, rng.uniform(low, high, (number, 3)))
+        scene = observed_scene(np.concatenate([points, more]), np.concatenate([normals, np.tile(Z, (number, 1))]))
+        scores[name] = rank(good, scene, exact_book(), criteria=["path"])[0]
+    assert scores["pixels"] > clear - 1
+    assert scores["board"] < clear - 5
+
+
+def test_of_two_books_the_one_with_more_room_is_surer() -> None:
+    points, normals, T_world_container = shelf(0.7)
+    scene, good = observed_scene(points, normals), at_gap(T_world_container)[None]
+    scores = [
+        rank(good, scene, ObjectFit("box", np.eye(4), np.array([width, *BOOK[1:]]), 0, 0, 1, 6), criteria=["path"])[0]
+        for width in (0.033, 0.039, 0.051)
+    ]
+    assert scores[0] > scores[1] + 1 > scores[2] + 4
+
+
+def test_what_stands_over_an_edge_is_worse_than_what_stands_on_it() -> None:
+    points, normals, T_world_container = shelf(0.0)
+    scene, can = observed_scene(points, normals), ObjectFit("cylinder", np.eye(4), np.array([0.03, 0.03, 0.08]), 0, 0, 1, 3)
+    ways = np.array([0.04, 0.09, 0.105, 0.125])  # the floor ends at 0.1
+    candidates = np.stack([T_world_container @ pose(translation=(x, 0, 0.05)) for x in ways])
+    for criterion in ("support", "balance"):
+        scores = rank(candidates, scene, can, criteria=[criterion])
+        assert np.all(np.diff(scores)[1:] < -0.5), criterion
+        assert scores[0] >= scores[1]
+
+
+def test_depth_is_that_of_the_deepest_points_in_the_swept_volume() -> None:
+    """A brute-force twin for a density at which each patch is one point."""
+    rng = np.random.default_rng(8)
+    points = rng.uniform(-0.15, 0.15, (40, 3))
+    flat = fit_container(points, np.tile(Z, (40, 1)))
+    scene = ObservedScene(points, np.zeros(40, bool), np.ones(40, bool), 1.0, replace(flat, T_world_front=np.eye(4)))
+    box = ObjectFit("box", np.eye(4), np.array([0.03, 0.05, 0.12]), 0.0, 0.0, 1.0, 6)
+    centres = rng.uniform(-0.1, 0.1, (30, 3))
+    scores = rank(np.stack([pose(translation=c) for c in centres]), scene, box, criteria=["path"])
+    for centre, score in zip(centres, scores):
+        deepest = -ROOM
+        for x, y, z in points - centre:
+            if z > -0.06 + FLOOR:
+                deepest = max(deepest, min(x + 0.015, 0.025 - abs(y), z + 0.06 - FLOOR, 0.06 - z))
+        assert score == pytest.approx(-1000 * min(deepest, DEPTH_CAP))
 
 
 def test_criteria_can_be_left_out_and_a_large_residual_costs() -> None:

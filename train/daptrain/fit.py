@@ -15,11 +15,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dapdata.poses import pose
-from daptrain.shapes import ObjectFit, fit_box, fit_cylinder
+from daptrain.shapes import ObjectFit, fit_box, fit_cylinder, thinned
 
 __all__ = ["ContainerFit", "ObjectFit", "fit_container", "fit_object", "fit_opening", "fit_yaw"]
 
 Array = NDArray[Any]
+
+OBJECT_POINTS = 1000  # more do not make a fit better: what is left is the error of the cameras' poses, not noise
+YAW_POINTS = 1500
+# Half width and step (rad) and width of bins (m) of the searches for the yaw, each around the best of the one before.
+# All around first: rows of cans have no flat faces, and the mean of their normals is anywhere.
+YAW_SWEEPS = ((np.pi / 4, np.pi / 90, 0.012), (0.03, 0.006, 0.006), (0.006, 0.001, 0.004))
 
 
 @dataclass(frozen=True)
@@ -43,6 +49,8 @@ def fit_object(points: Array, normals: Array) -> ObjectFit:
         ValueError: fewer than 20 points, or points that are not finite.
     """
     points, normals = _checked(points, normals, 20)
+    few = thinned(len(points), OBJECT_POINTS)
+    points, normals = points[few], normals[few]
     best, other = sorted((fit_box(points, normals), fit_cylinder(points, normals)), key=lambda fit: fit.misfit)
     return replace(best, other_misfit=other.misfit)
 
@@ -78,14 +86,11 @@ def fit_yaw(points: Array, normals: Array) -> float:
     if level.sum() < 20:  # a container without vertical faces in sight
         level = np.ones(len(points), bool)
     flat = points[level, :2] - points[level, :2].mean(axis=0)
-    # All around first: rows of cans have no flat faces, and the mean of their normals is anywhere.
-    start, sweeps = (
-        0.0,
-        ((np.pi / 4, np.pi / 120, 0.012), (0.026, 0.0065, 0.006), (0.006, 0.001, 0.004), (0.001, 0.00025, 0.003)),
-    )
-    for half_width, step, bin_width in sweeps:
+    flat = flat[thinned(len(flat), YAW_POINTS)]
+    start = 0.0
+    for half_width, step, bin_width in YAW_SWEEPS:
         tries = start + np.arange(-half_width, half_width + step / 2, step)
-        start = _parabola_peak(tries, np.array([_sharpness(flat, turn, bin_width) for turn in tries]))
+        start = _parabola_peak(tries, _sharpness(flat, tries, bin_width))
     return _quarter(start)
 
 
@@ -121,17 +126,18 @@ def _quarter(angle: float) -> float:
     return float((angle + np.pi / 4) % (np.pi / 2) - np.pi / 4)
 
 
-def _sharpness(flat: Array, turn: float, bin_width: float) -> float:
-    """Sum of squared counts of two histograms; neighbouring bins are added, so that bin edges do not matter."""
-    total = 0.0
-    for x, y in ((np.cos(turn), np.sin(turn)), (-np.sin(turn), np.cos(turn))):
-        place = (flat[:, 0] * x + flat[:, 1] * y) / bin_width
-        place -= place.min()
-        cell = place.astype(np.int64)
-        part = place - cell
-        counts = np.bincount(cell, 1 - part, cell.max() + 2) + np.bincount(cell + 1, part, cell.max() + 2)
-        total += float(counts @ counts)
-    return total
+def _sharpness(flat: Array, turns: Array, bin_width: float) -> Array:
+    """Sum of squared counts of two histograms for each turn (T,); a point counts for the two bins around it, in part."""
+    ways = np.stack([np.concatenate([np.cos(turns), -np.sin(turns)]), np.concatenate([np.sin(turns), np.cos(turns)])], axis=1)
+    place = ways @ flat.T / bin_width
+    place -= place.min()
+    cell = place.astype(np.int64)
+    part = place - cell
+    bins = int(cell.max()) + 2
+    cell += bins * np.arange(len(ways))[:, None]
+    size = bins * len(ways)
+    counts = np.bincount(cell.ravel(), 1 - part.ravel(), size) + np.bincount(cell.ravel() + 1, part.ravel(), size)
+    return np.asarray((counts**2).reshape(2, len(turns), bins).sum(axis=(0, 2)))
 
 
 def _parabola_peak(x: Array, y: Array) -> float:

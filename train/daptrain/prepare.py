@@ -160,12 +160,14 @@ def prepare_targets(sample: dict[str, Array], inputs: Inputs, rule: LabelRule, c
     goals, affordance = [T_world_demo], [sample["container_superpoints/affordance"]]
     if config.goals == "all":
         object_points = poses.transform(poses.inverse(T_world_start), sample["object/points"].astype(float))
+        points, near = sample["container/points"].astype(float), cKDTree(object_points)
         superpoint = sample["container/superpoint"]
+        size = np.bincount(superpoint)
         for T_world_goal in sample["goals/T_world_object"]:
             if np.abs(T_world_goal - T_world_demo).max() > 1e-6:
-                score = point_affordance(sample["container/points"], object_points, T_world_goal, rule)
+                score = point_affordance(points, near, T_world_goal, rule)
                 goals.append(T_world_goal)
-                affordance.append(np.bincount(superpoint, score) / np.bincount(superpoint))
+                affordance.append(np.bincount(superpoint, score) / size)
     T_front_world = poses.inverse(inputs.T_world_front)
     return Targets(
         affordance=_single(affordance),
@@ -176,21 +178,22 @@ def prepare_targets(sample: dict[str, Array], inputs: Inputs, rule: LabelRule, c
     )
 
 
-def point_affordance(container_points: Array, object_points: Array, T_world_object: Array, rule: LabelRule) -> Array:
+def point_affordance(container_points: Array, object_points: Array | cKDTree, T_world_object: Array, rule: LabelRule) -> Array:
     """(N,) score in [-1, 1] of container points (N, 3 world) for object points (M, 3 object frame) placed at a pose.
 
-    The same rule as the dataset's labels, computed in the object's frame so that one box test leaves few points.
+    The same rule as the dataset's labels, computed in the object's frame so that one box test leaves few points. A tree
+    of the object's points may be given in their stead, to be made once for many poses.
     """
-    local = poses.transform(poses.inverse(T_world_object), container_points.astype(float))
-    low, high = object_points.min(axis=0) - rule.eps_place, object_points.max(axis=0) + rule.eps_place
-    around = np.all((local >= low) & (local <= high), axis=1)
-    distance = np.full(len(local), np.inf)
-    if around.any():
-        distance[around] = cKDTree(object_points).query(local[around])[0]
-    near = distance <= rule.eps_place
+    tree = object_points if isinstance(object_points, cKDTree) else cKDTree(object_points)
+    local = poses.transform(poses.inverse(T_world_object), np.asarray(container_points, float))
+    around = np.all((local >= tree.mins - rule.eps_place) & (local <= tree.maxes + rule.eps_place), axis=1)
+    distance = tree.query(local[around])[0]
+    score = np.full(len(local), -1.0)
     if rule.kind == "hard":
-        return np.where(near, 1.0, -1.0)
-    return np.where(near, 2 * np.exp(-distance / rule.eps_place) - 1, -1.0)
+        score[around] = np.where(distance <= rule.eps_place, 1.0, -1.0)
+    else:
+        score[around] = np.where(distance <= rule.eps_place, 2 * np.exp(-distance / rule.eps_place) - 1, -1.0)
+    return score
 
 
 def reference_rotation(examples: list[Example]) -> Array:

@@ -121,7 +121,7 @@ def test_fourier_position_tells_places_apart_and_is_smooth():
 def test_fourier_features_are_cosines_and_sines_of_learned_frequencies():
     encode = FourierPosition(4, frequencies=3)
     point = torch.tensor([0.3, -0.2, 0.5])
-    phase = [2 * math.pi * sum(point[i] * encode.frequency[i, f] for i in range(3)) for f in range(3)]
+    phase = [2 * math.pi * sum(point[i] * encode.frequency[i, f].item() for i in range(3)) for f in range(3)]
     by_hand = torch.tensor([math.cos(p) for p in phase] + [math.sin(p) for p in phase])
     torch.testing.assert_close(encode(point), encode.project(by_hand), atol=1e-6, rtol=1e-5)
 

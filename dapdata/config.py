@@ -138,7 +138,8 @@ class TrainConfig(Section):
     validate_every: int = key(200, "steps between validations", ge=1, le=10_000_000)
     refine: bool = key(True, "candidates are refined on the observed cloud")
     ranking: Literal["full", "collision"] = key(
-        "full", "`full`: depth along the way in, support, balance; `collision`: container points inside the object's box, as published"
+        "full",
+        "`full`: depth along the way in, support, balance; `collision`: container points inside the object's box, as published",
     )
 
     @model_validator(mode="before")

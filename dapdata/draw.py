@@ -5,7 +5,8 @@ share one depth buffer. Everything is drawn at twice the wanted size and average
 differences ("eye-dome lighting") makes shapes readable where colours carry data.
 
     camera = frame(points, direction=(1, -0.3, 0.5), width=640, height=480)
-    canvas = render_cloud(points, colors, camera, normals)
+    canvas = blank(camera)
+    draw_cloud(canvas, points, colors, normals)
     draw_solids(canvas, kind, size, T_world_part, colors)
     pixels = image(canvas)  # (480, 640, 3) uint8
 
@@ -96,20 +97,6 @@ def blank(camera: Camera) -> Canvas:
     big = replace(camera, focal=camera.focal * OVERSAMPLE, width=camera.width * OVERSAMPLE, height=camera.height * OVERSAMPLE)
     shape = big.height, big.width
     return Canvas(big, np.tile(np.array(BACKGROUND, np.float32), (*shape, 1)), np.full(shape, np.inf, np.float32))
-
-
-def render_cloud(
-    points: Array,
-    colors: Array,
-    camera: Camera,
-    normals: Array | None = None,
-    radius: float = POINT_RADIUS,
-    light: float = 0.35,
-) -> Canvas:
-    """A new canvas with a point cloud on it; arguments as in `draw_cloud`."""
-    canvas = blank(camera)
-    draw_cloud(canvas, points, colors, normals, radius, light)
-    return canvas
 
 
 def draw_cloud(

@@ -11,6 +11,13 @@ RED, BLUE = (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)
 SHAPES = {"box": 0, "cylinder": 1, "ellipsoid": 2}
 
 
+def rendered(points: np.ndarray, colors: np.ndarray, camera: draw.Camera, *more: np.ndarray, **options: float) -> draw.Canvas:
+    """A new canvas with a point cloud on it."""
+    canvas = draw.blank(camera)
+    draw.draw_cloud(canvas, points, colors, *more, **options)
+    return canvas
+
+
 def front_camera(width: int = 80, height: int = 60) -> draw.Camera:
     """2 m in front of the origin on +x, 100 px focal length."""
     return draw.Camera(draw.look_at((2, 0, 0), (0, 0, 0)), 100.0, width, height)
@@ -48,20 +55,20 @@ def test_solids_are_where_the_depth_cameras_see_them(shape: str) -> None:
 def test_the_nearer_point_hides_the_farther() -> None:
     points, colors = np.array([[0.0, 0, 0], [0.5, 0, 0]]), np.array([BLUE, RED])
     for order in ([0, 1], [1, 0]):
-        pixels = draw.image(draw.render_cloud(points[order], colors[order], front_camera(), radius=0.1))
+        pixels = draw.image(rendered(points[order], colors[order], front_camera(), radius=0.1))
         assert mostly(pixels[30, 40], RED)
 
 
 def test_a_disc_seen_edge_on_is_a_line() -> None:
-    canvas = draw.render_cloud(np.zeros((1, 3)), np.array([RED]), front_camera(), np.array([[0, 0, 1.0]]), radius=0.2)
+    canvas = rendered(np.zeros((1, 3)), np.array([RED]), front_camera(), np.array([[0, 0, 1.0]]), radius=0.2)
     seen = np.isfinite(canvas.depth)
     assert seen.any(axis=1).sum() <= 3
-    flat = draw.render_cloud(np.zeros((1, 3)), np.array([RED]), front_camera(), np.array([[1.0, 0, 0]]), radius=0.2)
+    flat = rendered(np.zeros((1, 3)), np.array([RED]), front_camera(), np.array([[1.0, 0, 0]]), radius=0.2)
     assert np.isfinite(flat.depth).sum() == pytest.approx(np.pi * (0.2 * 200 / 2) ** 2, rel=0.1)
 
 
 def test_points_behind_the_camera_are_not_drawn() -> None:
-    canvas = draw.render_cloud(np.array([[3.0, 0, 0]]), np.array([RED]), front_camera())
+    canvas = rendered(np.array([[3.0, 0, 0]]), np.array([RED]), front_camera())
     assert not np.isfinite(canvas.depth).any()
 
 

@@ -5,7 +5,7 @@ time, Fourier position before every block, full attention over superpoints) deno
 
 Beyond the paper, each with its switch and all off in `preset: paper`:
 - `score_radii`: the noisy score also enters smoothed over several radii. Noise hides a region in each single
-  superpoint but not in their sum, and attention needs thousands of steps to find out by itself;
+  superpoint but not in their sum, and attention was slow to find that out by itself in a prototype;
 - `prediction: x0`: the clean score is predicted with binary cross-entropy instead of the noise with squared error;
 - `object_condition`: the object's fitted extents join the time token. The paper's p(score | container) cannot
   refuse a gap that is too narrow for this object.

@@ -3,7 +3,7 @@
 Steps are counted t = 0 .. T-1 and `alpha_bar[t]` is the share of signal variance left after step t + 1, so that
 "before step 0" is the clean score. One reverse formula serves all samplers: the Gaussian q(s_before | s_t, s_0) for
 any earlier step. With neighbouring steps it is the ancestral sampler of DDPM; with a subset of the steps it is its
-strided form (DDIM with eta = 1). 20 such steps were as good as all 100 when measured.
+strided form (DDIM with eta = 1). 20 such steps were as good as all 100 in a prototype.
 The variance is the posterior's; the paper's sigma_t^2 = beta_t is the other DDPM choice, which a cosine schedule
 (beta of the last step 0.999) makes needlessly noisy.
 """

@@ -1,6 +1,7 @@
 """Depth cameras around the container and the object -> fused, voxelled clouds in the world frame.
 
-`CamerasConfig` says where the cameras stand and how finely they see, `NoiseConfig` how badly. Segmentation is perfect:
+`CamerasConfig` says where the cameras stand and how finely they see, `NoiseConfig` how badly and how wrong we are about where
+they stand. What the views themselves tell about that is put right before they are fused (`align.py`). Segmentation is perfect:
 container cameras see container and clutter, object cameras see the object alone, at its start pose.
 """
 
@@ -41,6 +42,9 @@ class CamerasConfig(Section):
     yaw_jitter_deg: float = key(3.0, "yaws vary by up to +- this", unit="deg", ge=0, le=180)
     pitch_jitter_deg: float = key(12.0, "pitches vary by up to +- this", unit="deg", ge=0, le=45)
     focus_jitter: float = key(0.02, "what a camera looks at varies by up to +- this along each axis", unit="m", ge=0, le=0.2)
+    align: bool = key(
+        True, "views are aligned to each other where they overlap, before they are fused; off: as their poses are believed"
+    )
     container_voxel: float = key(
         0.008, "edge of the voxels that fuse the container's points; larger: fewer points", unit="m", ge=0.001, le=0.1
     )
@@ -79,11 +83,15 @@ def observe(demo: Demo, cameras: CamerasConfig, noise: NoiseConfig, rng: np.rand
     to_container = container_views(demo, cameras, noise, rng)
     to_object = object_views(demo, cameras, noise, rng)
     T_world_part = demo.T_world_container @ demo.T_container_part
-    container = _look(to_container, demo.part_kind, demo.part_size, T_world_part, cameras, noise, cameras.container_voxel)
+    container, of_container = _look(
+        to_container, demo.part_kind, demo.part_size, T_world_part, cameras, noise, cameras.container_voxel
+    )
     if len(container.points) < cameras.min_container_points:
         return Rejected("too_few_container_points")
     T_world_part = demo.T_world_object_start @ demo.T_object_part
-    object_ = _look(to_object, demo.object_kind, demo.object_size, T_world_part, cameras, noise, cameras.object_voxel)
+    object_, of_object = _look(
+        to_object, demo.object_kind, demo.object_size, T_world_part, cameras, noise, cameras.object_voxel
+    )
     if len(object_.points) < cameras.min_object_points:
         return Rejected("too_few_object_points")
     return Cloud(
@@ -94,22 +102,31 @@ def observe(demo: Demo, cameras: CamerasConfig, noise: NoiseConfig, rng: np.rand
         object_normals=object_.normals,
         object_view=object_.view,
         camera_K=np.stack([view.K for view in to_container + to_object]),
-        T_world_camera=np.stack([view.T_world_camera for view in to_container + to_object]),
+        T_world_camera=np.concatenate([of_container, of_object]),
     )
 
 
 def _look(
     views: list[View], kind: Array, size: Array, T_world_part: Array, cameras: CamerasConfig, noise: NoiseConfig, voxel: float
-) -> Fused:
-    """The fused cloud of some parts, (P,) (P, 3) (P, 4, 4), through the given views."""
+) -> tuple[Fused, Array]:
+    """The fused cloud of some parts, (P,) (P, 3) (P, 4, 4), through V views, and (V, 4, 4) the poses it was fused with."""
+    from dapdata.observe.align import align
     from dapdata.observe.fuse import fuse, view_cloud
     from dapdata.observe.noise import add_noise
     from dapdata.observe.raycast import cast
-    from dapdata.poses import inverse
+    from dapdata.poses import inverse, rotate, transform
 
     clouds = []
     for view in views:
         T_camera_part = inverse(view.T_world_camera_true) @ T_world_part
         image = cast(kind, size, T_camera_part, view.K, view.width, view.height, cameras.near, cameras.far)
         clouds.append(view_cloud(add_noise(image, view.K, noise.preset, view.noise_seed), view))
-    return fuse([points for points, _ in clouds], [normals for _, normals in clouds], voxel)
+    points, normals = [points for points, _ in clouds], [normals for _, normals in clouds]
+    T_world_camera = np.stack([view.T_world_camera for view in views])
+    if cameras.align and len(views) > 1:
+        T_world_camera = align(views, points, normals)
+        for v, view in enumerate(views):
+            T_aligned_world = T_world_camera[v] @ inverse(view.T_world_camera)
+            points[v] = transform(T_aligned_world, points[v]).astype(np.float32)
+            normals[v] = rotate(T_aligned_world, normals[v]).astype(np.float32)
+    return fuse(points, normals, voxel), T_world_camera

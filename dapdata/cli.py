@@ -73,7 +73,7 @@ Minutes = Annotated[
 InSplit = Annotated[Split, typer.Option("--split", help="Which demos.")]
 Trials = Annotated[int | None, _option("--trials", help="Demos of the split that are judged", default="the recipe's", min=1)]
 Rules = Annotated[Protocol | None, _option("--protocol", help="Rules of the judge", default="the recipe's")]
-K = Annotated[int | None, _option("-k", "--k", help="Candidates for each demo", default="the recipe's", min=1)]
+K = Annotated[int | None, _option("-k", "--k", help="Candidates for each demo that are judged", default="the recipe's", min=1)]
 JsonFile = Annotated[Path | None, _option("--out", help="File for the result as JSON", metavar="FILE.json")]
 
 app = typer.Typer(
@@ -316,9 +316,7 @@ def train(
     from daptrain import train as train_networks
 
     folder = last("dataset", dataset)
-    stray = [override for override in overrides or () if not override.startswith("train.")]
-    if stray:
-        raise UsageError(f"--set {stray[0]}: expected a key of the train section, such as train.minutes=10")
+    _train_keys(overrides)
     about = manifest.read(folder)
     config = recipe.from_resolved(about.recipe, overrides or (), str(folder / manifest.MANIFEST)).train
     target = run or Path("runs") / folder.resolve().name
@@ -338,15 +336,45 @@ def evaluate(
         str | None, _option("--method", help="dap, cap; or oracle, random, heuristic, without a run", default="the run's")
     ] = None,
     k: K = None,
+    draws: Annotated[
+        int | None,
+        _option("--draws", help="Candidates for each demo that modes are counted on", default="the recipe's, or k", min=1),
+    ] = None,
+    overrides: Annotated[
+        list[str] | None,
+        _option("--set", help="Override of a train key that acts at inference (--curve: of any)", metavar="KEY=VALUE"),
+    ] = None,
+    curve: Annotated[
+        str | None,
+        _option("--curve", help="Train anew on so many demos each, such as 10,20,40, and judge them all", metavar="N,N,..."),
+    ] = None,
+    minutes: Annotated[
+        float | None, _option("--minutes", help="With --curve: budget of each size", default="the recipe's", metavar="M")
+    ] = None,
+    steps: Annotated[
+        int | None, _option("--steps", help="With --curve: optimiser steps of each network", min=1, metavar="N")
+    ] = None,
     device: Device = "auto",
     workers: Workers = None,
-    out: Annotated[Path | None, _option("--out", help="Folder to write", default="the run", metavar="DIR")] = None,
+    out: Annotated[
+        Path | None,
+        _option(
+            "--out", help="Folder to write", default="the run; with --set or --curve another, which is said", metavar="DIR"
+        ),
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Predict on a split, then judge in physics. Writes predictions.npz, report.json, report.html, pictures of failures."""
     from daptrain import evaluate as evaluate_run
     from daptrain.checkpoint import read_description
 
+    judging: dict[str, Any] = {"split": split, "trials": trials, "protocol": protocol, "k": k, "draws": draws, "device": device}
+    if curve is not None:
+        asked = judging | {"minutes": minutes, "steps": steps, "workers": _count(workers)}
+        _evaluate_curve(curve, run, data, out, overrides, method, as_json, asked)
+        return
+    if minutes is not None or steps is not None:
+        raise UsageError("--minutes, --steps: nothing is trained without --curve; train with: dapdata train")
     if method in (None, "dap", "cap"):
         run = last("run", run)
         method = method or str(read_description(run)["method"])
@@ -354,18 +382,8 @@ def evaluate(
         out = out or run.parent / f"{method}-{run.name}"
     elif data is None:
         data = last("dataset", None)
-    report = evaluate_run(
-        run,
-        data,
-        split=split,
-        trials=trials,
-        protocol=protocol,
-        method=method,
-        k=k,
-        device=device,
-        workers=_count(workers),
-        out=out,
-    )
+    changes = _train_keys(overrides)
+    report = evaluate_run(run, data, method=method, changes=changes, workers=_count(workers), out=out, **judging)
     if run is not None:
         remember(run=run)
     show(report, as_json, report_text(report))
@@ -378,6 +396,9 @@ def judge(
     split: InSplit = "test",
     trials: Annotated[int | None, _option("--trials", help="Demos of the split that are judged", default="all", min=1)] = None,
     protocol: Annotated[Protocol, typer.Option("--protocol", help="Rules of the judge.")] = "strict",
+    k: Annotated[
+        int | None, _option("-k", "--k", help="Candidates for each demo that are judged, by rank", default="all", min=1)
+    ] = None,
     out: JsonFile = None,
     workers: Workers = None,
     as_json: Json = False,
@@ -387,7 +408,9 @@ def judge(
 
     if out is not None:  # before the work, so that it is not lost
         out.parent.mkdir(parents=True, exist_ok=True)
-    report = judge_file(predictions, data, protocol, split=split, trials=trials, workers=_count(workers), progress=seldom(say))
+    report = judge_file(
+        predictions, data, protocol, split=split, trials=trials, k=k, workers=_count(workers), progress=seldom(say)
+    )
     if out is not None:
         out.write_text(json.dumps(report, indent=1), encoding="utf-8")
     _show_report(report, as_json)
@@ -516,6 +539,49 @@ def _recipe(path: Path, overrides: list[str] | None, demos: int | None) -> Any:
     from dapdata.recipe import load
 
     return load(path, [*(overrides or ()), *([f"demos={demos}"] if demos is not None else [])])
+
+
+def _train_keys(overrides: list[str] | None) -> dict[str, Any]:
+    """Keys of the train section that `--set` gives, with their values as written; any other section is refused."""
+    from dapdata.strict_yaml import Source
+
+    source = Source("--set")
+    for override in overrides or ():
+        if not override.startswith("train."):
+            raise UsageError(f"--set {override}: expected a key of the train section, such as train.sample_steps=10")
+        source.override(override)
+    return dict(source.tree.get("train", {}))
+
+
+def _evaluate_curve(
+    sizes: str,
+    run: Path | None,
+    data: Path | None,
+    out: Path | None,
+    overrides: list[str] | None,
+    method: str | None,
+    as_json: bool,
+    asked: dict[str, Any],
+) -> None:
+    """`dapdata eval --curve`; `asked` are further arguments of `daptrain.curve.curve`."""
+    from dapdata import manifest, recipe
+    from daptrain.checkpoint import read_description
+    from daptrain.curve import curve, text
+    from daptrain.evaluation import data_of
+
+    numbers = sizes.replace(" ", "").split(",")
+    if not all(number.isdecimal() for number in numbers):
+        raise UsageError(f"--curve: got '{sizes}', expected numbers of demos with commas between them, such as 10,20,40")
+    description = {} if run is None else read_description(run)
+    folder = data or (last("dataset", None) if run is None else Path(data_of(run)))
+    _train_keys(overrides)
+    resolved = manifest.read(folder).recipe | ({"train": description["train"]} if description else {})
+    config = recipe.from_resolved(resolved, overrides or (), str(run or folder / manifest.MANIFEST)).train
+    method = method or str(description.get("method", "dap"))
+    target = out or run or Path("runs") / f"curve-{folder.resolve().name}"
+    found = curve(folder, target, [int(number) for number in numbers], config=config, method=method, **asked)
+    remember(dataset=folder)
+    show(found, as_json, f"{text(found)}\n\n{target / 'curve.html'}")
 
 
 def _count(workers: int | None) -> int:

@@ -6,9 +6,9 @@ range and a sentence. Each stage's section stands above the stage that uses it; 
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar, get_args
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, field_validator, model_validator
 
 
 class Section(BaseModel):
@@ -78,9 +78,18 @@ PAPER: dict[str, Any] = {
     "object_condition": False,
     "residual": False,
     "sample_steps": 100,
-    "refine": False,
-    "ranking": "collision",
+    "cap_crop": "whole",
+    "refine": [],
+    "ranking": ["collision"],
 }
+
+# Keys that inference reads: `dapdata eval --set train.KEY=VALUE` changes them without training again. Only `crop_margin`
+# acts in training as well, with anything from none of it to twice as much.
+AT_INFERENCE = ("sample_steps", "crop_margin", "cap_crop", "refine", "ranking")
+
+# STEPS and CRITERIA of daptrain.refine, which must not be imported here; a test compares them.
+Step = Literal["gravity", "yaw", "settle", "search"]
+Criterion = Literal["inside", "path", "support", "balance", "residual"]
 
 
 class TrainConfig(Section):
@@ -90,6 +99,7 @@ class TrainConfig(Section):
         "default", "`paper`: eps prediction of one goal per demo, no refinement, ranking by collision count, as published"
     )
     minutes: float = key(30.0, "wall-clock budget of both networks together", unit="min", gt=0, le=100_000)
+    demos: int | None = key(None, "train on the first so many demos of the train split; null: on all", ge=1, le=10_000_000)
     affordance_share: float = key(
         0.5,
         "share of the minutes that net 1 gets where the networks are trained one after the other (GPU, single core)",
@@ -136,10 +146,18 @@ class TrainConfig(Section):
     clip: float = key(1.0, "largest norm of a gradient", gt=0, le=1e6)
     ema: float = key(0.998, "decay of the averaged weights, which are the ones that are kept", ge=0, lt=1)
     validate_every: int = key(200, "steps between validations", ge=1, le=10_000_000)
-    refine: bool = key(True, "candidates are refined on the observed cloud")
-    ranking: Literal["full", "collision"] = key(
-        "full",
-        "`full`: depth along the way in, support, balance; `collision`: container points inside the object's box, as published",
+    cap_crop: Literal["whole", "peak", "peaks"] = key(
+        "peaks",
+        "what net 2 sees of the one map of `--method cap`: `whole`: all that is classified positive, as published; `peak`: the "
+        "region of the best peak, for each candidate; `peaks`: the region of a peak of its own for each",
+    )
+    refine: list[Step] = key(
+        list(get_args(Step)), "what is done to candidates on the observed cloud, in this order however listed; []: nothing"
+    )
+    ranking: list[Literal[Criterion, "collision"]] = key(
+        list(get_args(Criterion)),
+        "what candidates are ranked by; [collision], alone: container points inside the object's box, as published; "
+        "[]: as drawn",
     )
 
     @model_validator(mode="before")
@@ -161,10 +179,31 @@ class TrainConfig(Section):
                     )
         return self
 
+    @field_validator("refine", "ranking")
+    @classmethod
+    def check_names(cls, names: list[str]) -> list[str]:
+        """Each name once; the collision count is a ranking of its own."""
+        if len(set(names)) < len(names):
+            raise ValueError(f"got [{', '.join(names)}], expected each name at most once; leave out the repeated one")
+        if "collision" in names and len(names) > 1:
+            raise ValueError(
+                f"got [{', '.join(names)}], expected collision to stand alone: it counts points, the others are mm of depth; "
+                "write [collision], or leave it out"
+            )
+        return names
+
 
 class EvalConfig(Section):
     """How predictions are made and judged."""
 
     trials: int = key(100, "demos of the split that are judged", ge=1)
-    k: int = key(8, "candidates per demo", ge=1, le=1024)
+    k: int = key(8, "candidates per demo that are ranked and judged", ge=1, le=1024)
+    draws: int | None = key(None, "candidates per demo that the modes are counted on, at least k; null: k", ge=1, le=1024)
     protocol: Literal["strict", "rpdiff"] = key("strict", "rules of the judge, see docs/metrics.md")
+
+    @model_validator(mode="after")
+    def check_draws(self) -> EvalConfig:
+        """What is judged was drawn."""
+        if self.draws is not None and self.draws < self.k:
+            raise ValueError(f"draws: got {self.draws}, expected at least k ({self.k}), or null for as many")
+        return self

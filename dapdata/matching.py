@@ -156,6 +156,25 @@ def assign(distance: Array, tau: Array) -> Array:
     return np.where(np.isfinite(inside.min(axis=1)), inside.argmin(axis=1), -1)
 
 
+def legacy_rpdiff(T_a: Array, T_b: Array) -> Array:
+    """Which predictions RPDiff's coverage would take to be at which goals; for reference only, see docs/metrics.md.
+
+    Args:
+        T_a: (K, 4, 4) predictions.
+        T_b: (M, 4, 4) goals.
+
+    Returns:
+        (2, K, M) bool, for its recall (closer than 3.5 cm) and for its precision (4 cm). Its "5 degrees" compare
+        sin^2(half the angle) with 5 degrees in rad, which is 34.4 degrees; no symmetry is known to it.
+
+    Source: `compute_coverage` of RPDiff's code. Its search for the nearest goal takes any pair within both limits and
+    then keeps to such pairs, so that a goal is found if any prediction is within both limits of it, and so here.
+    """
+    apart = np.linalg.norm(T_a[:, None, :3, 3] - T_b[None, :, :3, 3], axis=-1)
+    turned = (3 - np.einsum("kij,mij->km", T_a[:, :3, :3], T_b[:, :3, :3])) / 4  # sin^2 of half the angle
+    return np.stack([(apart < limit) & (turned < np.deg2rad(5.0)) for limit in (0.035, 0.04)])
+
+
 # Affordance ------------------------------------------------------------------------------------------------
 
 

@@ -29,6 +29,7 @@ from dapdata.matching import (
     assign,
     hull_points,
     is_tight,
+    legacy_rpdiff,
     mode_entropy,
     surface_distance,
     tolerance,
@@ -46,6 +47,7 @@ from dapdata.report import (
     Geometry,
     Interval,
     Judge,
+    LegacyRpdiff,
     Method,
     Modes,
     Quantiles,
@@ -128,31 +130,38 @@ def quantiles(values: Array) -> Quantiles:
 
 @dataclass(frozen=True)
 class SceneResult:
-    """What one scene's candidates came to, best first; there may be none."""
+    """What one scene's C candidates came to, by rank; the first K of them were judged. There may be none."""
 
     demo: int
-    T_world_object: Array  # (K, 4, 4)
+    T_world_object: Array  # (C, 4, 4)
     verdicts: list[Verdict]  # K
-    distance: Array  # (K, M) m, surface distance to each verified goal
-    nearest: Array  # (K, 2) m and rad, translation and rotation to the goal of least surface distance
+    distance: Array  # (C, M) m, surface distance to each verified goal
+    nearest: Array  # (C, 2) m and rad, translation and rotation to the goal of least surface distance
     tau: Array  # (M,) m
     tight: Array  # (M,) bool
-    seconds: float  # of physics, all candidates
+    seconds: float  # of physics, all K
+    rank: Array  # (C,) rising, with gaps where a candidate has no pose
+    legacy: Array  # (2, C, M) bool, from `legacy_rpdiff`
 
 
-def judge_scene(demo: Demo, T_world_object: Array, placement: PlacementConfig, protocol: Protocol) -> SceneResult:
-    """The judge's verdicts on all candidates of one scene, and their distances to its goals.
+def judge_scene(
+    demo: Demo, T_world_object: Array, rank: Array, k: int, placement: PlacementConfig, protocol: Protocol
+) -> SceneResult:
+    """The judge's verdicts on the k best candidates of one scene, and the distances of all to its goals.
 
     Args:
         demo: The scene.
-        T_world_object: (K, 4, 4) candidates, best first; K may be 0.
+        T_world_object: (C, 4, 4) candidates by rank; C may be 0.
+        rank: (C,) rising; those below k are judged.
+        k: Candidates that are judged.
         placement: The judge's parameters, from the dataset's recipe.
         protocol: "strict" or "rpdiff".
     """
     from dapdata import simulate
 
     start = time.perf_counter()
-    verdicts = list(simulate.judge(demo, T_world_object, placement, protocol)) if len(T_world_object) else []
+    judged = T_world_object[rank < k]
+    verdicts = list(simulate.judge(demo, judged, placement, protocol)) if len(judged) else []
     seconds = time.perf_counter() - start
     symmetry, axis = SYMMETRIES[int(demo.symmetry_kind)], np.asarray(demo.symmetry_axis, float)
     points = hull_points(demo.object_kind, demo.object_size, demo.T_object_part)
@@ -167,6 +176,8 @@ def judge_scene(demo: Demo, T_world_object: Array, placement: PlacementConfig, p
         tolerance(demo.goal_clearance),
         is_tight(demo.goal_clearance, demo.goal_kind),
         seconds,
+        rank,
+        legacy_rpdiff(T_world_object, demo.goals),
     )
 
 
@@ -180,19 +191,19 @@ def judge_all(
     workers: int = 1,
     progress: Callable[[str], None] | None = None,
 ) -> list[SceneResult]:
-    """Results of the k best candidates of every scene, in the scenes' order, whatever the number of workers.
+    """Results of every scene, in the scenes' order, whatever the number of workers; the k best candidates are judged.
 
     Args:
         predictions: Candidates; those of other demos are left alone.
         samples: One demo each, arrays by shard path.
         placement: The judge's parameters.
         protocol: "strict" or "rpdiff".
-        k: Candidates that count.
+        k: Candidates that are judged: those whose rank is less.
         workers: Processes.
         progress: Called once a scene.
     """
     demos = [read_record(Demo, dict(sample)) for sample in samples]
-    jobs = [(demo, predictions.of(int(demo.demo))[:k], placement, protocol) for demo in demos]
+    jobs = [(demo, predictions.of(int(demo.demo)), predictions.ranks(int(demo.demo)), k, placement, protocol) for demo in demos]
     results = []
     for result in _run(jobs, workers):
         results.append(result)
@@ -201,7 +212,7 @@ def judge_all(
     return results
 
 
-def _run(jobs: Sequence[tuple[Demo, Array, PlacementConfig, Protocol]], workers: int) -> Iterator[SceneResult]:
+def _run(jobs: Sequence[tuple[Demo, Array, Array, int, PlacementConfig, Protocol]], workers: int) -> Iterator[SceneResult]:
     if workers <= 1 or len(jobs) < 2:
         yield from (judge_scene(*job) for job in jobs)
         return
@@ -224,14 +235,15 @@ def oracle(samples: Sequence[Sample], k: int) -> Predictions:
 # Reporting -------------------------------------------------------------------------------------------------
 
 
-def summarise(results: Sequence[SceneResult], k: int) -> Summary:
+def summarise(results: Sequence[SceneResult], k: int, draws: int) -> Summary:
     """All figures of one method.
 
     Args:
         results: One a scene; scenes without candidates included.
-        k: Candidates that were asked for; those that are missing count as failures.
+        k: Candidates that were to be judged; those that are missing count as failures.
+        draws: Candidates that the modes are counted on, at least k; those that are missing find nothing.
     """
-    return Summary(success=_success(results, k), modes=_modes(results, k), geometry=_geometry(results))
+    return Summary(success=_success(results, k), modes=_modes(results, draws), geometry=_geometry(results))
 
 
 def _success(results: Sequence[SceneResult], k: int) -> Success:
@@ -250,46 +262,64 @@ def _success(results: Sequence[SceneResult], k: int) -> Success:
         success_single=mean(shares),
         success_precise=rate(top_ok & np.array(precise, bool)),
         success_near_goal=rate(top_ok & np.array(near, bool)),
-        success_tight=rate((top_ok & np.array(at_tight, bool))[has_tight]),
+        success_top1_tight=rate((top_ok & np.array(at_tight, bool))[has_tight]),
+        success_tight=rate(np.array([_tight_asked(r) for r in results], bool)[has_tight]),
         failures=_sorted(Counter(v.reason if v else NO_PREDICTION for v in top if v is None or not v.success)),
         failures_all=_sorted(Counter(v.reason for r in results for v in r.verdicts if not v.success) + missing),
     )
+
+
+def _tight_asked(result: SceneResult) -> bool:
+    """Whether the best-ranked of the candidates that head for a tight goal succeeds there; False where none does."""
+    heads_for_tight = result.tight[result.distance[: len(result.verdicts)].argmin(axis=1)] if result.verdicts else np.zeros(0)
+    if not heads_for_tight.any():
+        return False
+    i = int(np.argmax(heads_for_tight))
+    return result.verdicts[i].success and bool((result.distance[i][result.tight] <= NEAR_GOAL).any())
 
 
 def _sorted(counts: Counter[str]) -> dict[str, int]:
     return dict(sorted(counts.items(), key=lambda item: (-item[1], item[0])))
 
 
-def _modes(results: Sequence[SceneResult], k: int) -> Modes:
+def _modes(results: Sequence[SceneResult], draws: int) -> Modes:
     number = np.array([len(r.tau) for r in results])
-    counts = [c for c in COUNTS if c < k] + [k]
+    counts = [c for c in COUNTS if c < draws] + [draws]
     found = {c: [_found(r, r.tau, c) for r in results] for c in counts}
+    recall = {str(c): mean(np.array([f for f, _ in found[c]]) / number) for c in counts}
+    uniform = {str(c): float(np.mean([uniform_recall(m, c) for m in number])) for c in counts}
     sweep = {}
     for tau in SWEEP:
-        swept = np.array([_found(r, np.full(len(r.tau), tau / 1000), k) for r in results])
+        swept = np.array([_found(r, np.full(len(r.tau), tau / 1000), draws) for r in results])
         sweep[str(tau)] = {
             "recall": float((swept[:, 0] / number).mean()),
             "all_modes_found": float((swept[:, 0] == number).mean()),
-            "precision": float(swept[:, 1].mean() / k),
+            "precision": float(swept[:, 1].mean() / draws),
         }
-    entropies = [mode_entropy(assign(r.distance[:k], r.tau), len(r.tau)) for r in results]
+    drawn = [r.rank < draws for r in results]
+    entropies = [mode_entropy(assign(r.distance[d], r.tau), len(r.tau)) for r, d in zip(results, drawn)]
     return Modes(
         tau_mm=quantiles(np.concatenate([r.tau for r in results]) * 1000),
         modes=quantiles(number),
-        recall_at_K={str(c): mean(np.array([f for f, _ in found[c]]) / number) for c in counts},
-        uniform_recall_at_K={str(c): float(np.mean([uniform_recall(m, c) for m in number])) for c in counts},
+        recall_at_K=recall,
+        uniform_recall_at_K=uniform,
+        recall_share_at_K={c: recall[c].value / uniform[c] for c in recall},
         all_modes_found_at_K={str(c): rate(np.array([f for f, _ in found[c]]) == number) for c in counts},
         uniform_all_modes_found_at_K={str(c): float(np.mean([uniform_all_found(m, c) for m in number])) for c in counts},
         precision_at_K={str(c): mean(np.array([p for _, p in found[c]]) / c) for c in counts},
         sweep_mm=sweep,
         entropy=mean(np.array(entropies)),
-        uniform_entropy=float(np.mean([uniform_entropy(m, k) for m in number])),
+        uniform_entropy=float(np.mean([uniform_entropy(m, draws) for m in number])),
+        legacy_rpdiff=LegacyRpdiff(
+            recall=mean(np.array([r.legacy[0, d].any(axis=0).mean() for r, d in zip(results, drawn)])),
+            precision=mean(np.array([r.legacy[1, d].any(axis=1).sum() / draws for r, d in zip(results, drawn)])),
+        ),
     )
 
 
 def _found(result: SceneResult, tau: Array, count: int) -> tuple[int, int]:
-    """How many modes the first candidates find, and how many of these candidates are at a mode."""
-    inside = result.distance[:count] <= tau
+    """How many modes the candidates of rank below count find, and how many of these candidates are at a mode."""
+    inside = result.distance[result.rank < count] <= tau
     return int(inside.any(axis=0).sum()), int(inside.any(axis=1).sum())
 
 
@@ -360,13 +390,15 @@ def judge_dataset(
 ) -> tuple[Report, dict[str, list[SceneResult]]]:
     """The report on predictions and what it was made from: the oracle first, then the references, then the method.
 
+    Candidates of rank below k are judged in physics. The modes are counted on all, judged or not.
+
     Args:
         predictions: Candidates for scenes of the split; judged scenes without any are failures.
         dataset: The opened split.
         protocol: "strict" or "rpdiff".
         split: Name of the split.
         trials: Judge the first so many scenes of the split; all when None.
-        k: Candidates asked for in a scene; the largest rank + 1 when None.
+        k: Candidates of a scene that are judged; the largest rank + 1, and so all, when None.
         method: Name of the method.
         saw_ground_truth: Whether the method saw more than the clouds.
         settings: Of the method, for the record.
@@ -389,24 +421,26 @@ def judge_dataset(
         raise UsageError(f"{dataset.root}: split '{split}': got 0 demos, expected at least 1; choose another split")
     samples = [dataset[i] for i in range(number)]
     _check_demos(predictions, dataset, split, origin)
-    k = k or int(predictions.rank.max(initial=0)) + 1
+    largest = int(predictions.rank.max(initial=0)) + 1
+    k = k or largest
+    draws = max(k, largest)
     placement = recipes.from_resolved(dataset.recipe).placement
-    sources = {"oracle": oracle(samples, k), **(references or {})}
+    sources = {"oracle": oracle(samples, draws), **(references or {})}
     results: dict[str, list[SceneResult]] = {}
     for name, source in {**sources, method: predictions}.items():
         if name in sources and name == method:
             source = predictions
         say = (lambda line, name=name: progress(f"{name}: {line}")) if progress else None
         results[name] = judge_all(source, samples, placement, protocol, k=k, workers=workers, progress=say)
-    references_out = {name: summarise(results[name], k) for name in sources}
-    mine = summarise(results[method], k)
+    references_out = {name: summarise(results[name], k, draws) for name in sources}
+    mine = summarise(results[method], k, draws)
     if affordance is not None:
         mine = mine.model_copy(update={"affordance": _affordance(affordance, samples)})
     oracle_rate = references_out["oracle"].success.success_top1
     report = Report(
         task=str(dataset.task),
         split=_split(split, results[method], samples),
-        method=_method(method, k, saw_ground_truth, results[method], settings),
+        method=_method(method, k, draws, saw_ground_truth, results[method], settings),
         digests=Digests(
             predictions=predictions.sha256,
             data=str(dataset.digest),
@@ -430,7 +464,7 @@ def judge_dataset(
         references=references_out,
         cost=_cost(cost, results[method]),
         notes=_notes(oracle_rate, results[method], k),
-        scenes=[_row(r, len(r.tau), k) for r in results[method]],
+        scenes=[_row(r, len(r.tau), draws) for r in results[method]],
     )
     return report, results
 
@@ -468,11 +502,14 @@ def _split(name: str, results: Sequence[SceneResult], samples: Sequence[Sample])
     )
 
 
-def _method(name: str, k: int, saw: bool, results: Sequence[SceneResult], settings: Mapping[str, Any] | None) -> Method:
+def _method(
+    name: str, k: int, draws: int, saw: bool, results: Sequence[SceneResult], settings: Mapping[str, Any] | None
+) -> Method:
     predicted = sum(bool(r.verdicts) for r in results)
     return Method(
         name=name,
         k=k,
+        draws=draws,
         saw_ground_truth=saw,
         n_predicted=predicted,
         n_no_prediction=len(results) - predicted,
@@ -491,7 +528,7 @@ def _cost(cost: Cost | None, results: Sequence[SceneResult]) -> Cost:
     return (cost or Cost()).model_copy(update={"physics_s": seconds})
 
 
-def _row(result: SceneResult, modes: int, k: int) -> SceneRow:
+def _row(result: SceneResult, modes: int, draws: int) -> SceneRow:
     top = result.verdicts[0] if result.verdicts else None
     return SceneRow(
         demo=result.demo,
@@ -500,7 +537,7 @@ def _row(result: SceneResult, modes: int, k: int) -> SceneRow:
         successes=sum(v.success for v in result.verdicts),
         candidates=len(result.verdicts),
         modes=modes,
-        modes_found=_found(result, result.tau, k)[0],
+        modes_found=_found(result, result.tau, draws)[0],
     )
 
 

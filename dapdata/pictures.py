@@ -24,6 +24,7 @@ Sample = Mapping[str, Array]
 PANEL = 430, 380  # px, of each of the four large pictures of a row
 INSET = 150  # px, of the two small pictures of the object
 GUTTER, ROW_TITLE, HEADER, FOOTER = 14, 40, 74, 118  # px
+BAR = PANEL[0] - 180  # px, length of a bar of colours
 DPI = 100
 SIDE, ABOVE = 0.42, 0.36  # the viewer stands this far aside and above, per unit in front of the opening
 WOOD, CLUTTER = (0.93, 0.90, 0.85), (0.70, 0.73, 0.79)
@@ -193,15 +194,11 @@ def _listed(codes: Array, names: tuple[str, ...]) -> str:
 
 def sheet(shown: Sequence[Shown], heading: str) -> bytes:
     """A contact sheet as the bytes of a PNG: one row per demo, columns and legends named."""
-    errors.require("matplotlib", "sim").use("Agg")
-    from matplotlib import pyplot
-
     tops = max(float(s.sample["container/points"][:, 2].max()) for s in shown)
     columns = [(INSET, "object"), *((PANEL[0], name) for name in ("cloud", "superpoints", "affordance", "goals"))]
     width = sum(w + GUTTER for w, _ in columns) + GUTTER
     height = HEADER + len(shown) * (ROW_TITLE + PANEL[1]) + FOOTER
-    figure = pyplot.figure(figsize=(width / DPI, height / DPI), dpi=DPI, facecolor="white")
-    place = _Place(figure, width, height)
+    place = Place(width, height)
     place.text(GUTTER, 22, heading, size=17, weight="bold")
     x = GUTTER
     for w, name in columns:
@@ -215,10 +212,7 @@ def sheet(shown: Sequence[Shown], heading: str) -> bytes:
         place.line(GUTTER, width - GUTTER, y + 3)
         _draw_row(place, panels(item.sample, tops), columns, y + ROW_TITLE)
     _legends(place, shown, tops, height - FOOTER, width)
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", metadata={"Software": "dapdata"})
-    pyplot.close(figure)
-    return buffer.getvalue()
+    return place.png()
 
 
 COLUMN_TITLES = {
@@ -230,13 +224,15 @@ COLUMN_TITLES = {
 }
 
 
-@dataclass
-class _Place:
-    """Puts things on a matplotlib figure in pixels from its upper left corner."""
+class Place:
+    """A figure on which things are put in pixels from its upper left corner."""
 
-    figure: Any
-    width: int
-    height: int
+    def __init__(self, width: int, height: int) -> None:
+        errors.require("matplotlib", "sim")
+        from matplotlib.figure import Figure
+
+        self.width, self.height = width, height
+        self.figure = Figure(figsize=(width / DPI, height / DPI), dpi=DPI, facecolor="white")
 
     def text(self, x: float, y: float, text: str, **style: Any) -> None:
         self.figure.text(x / self.width, 1 - y / self.height, text, va="center", **style)
@@ -254,8 +250,21 @@ class _Place:
     def picture(self, x: float, y: float, pixels: Array) -> None:
         self.axes(x, y, pixels.shape[1], pixels.shape[0]).imshow(pixels, interpolation="none", aspect="auto")
 
+    def bar(self, x: float, y: float, length: int, colors: Array, labels: Sequence[str], name: str) -> None:
+        """A bar of colours with a name above it, and words under its left end, middle and right end."""
+        self.axes(x, y, length, 12).imshow(colors[None], aspect="auto")
+        for share, label, align in zip((0, 0.5, 1), labels, ("left", "center", "right")):
+            self.text(x + share * length, y + 24, label, size=9, color="#333", ha=align)
+        self.text(x + length / 2, y - 10, name, size=10, color="#333", ha="center")
 
-def _draw_row(place: _Place, pictures: dict[str, Array], columns: list[tuple[int, str]], y: int) -> None:
+    def png(self) -> bytes:
+        """The figure as the bytes of a PNG file; the same bytes for the same things on it."""
+        buffer = io.BytesIO()
+        self.figure.savefig(buffer, format="png", metadata={"Software": "dapdata"})
+        return buffer.getvalue()
+
+
+def _draw_row(place: Place, pictures: dict[str, Array], columns: list[tuple[int, str]], y: int) -> None:
     x = GUTTER
     for w, name in columns:
         if name == "object":
@@ -266,15 +275,16 @@ def _draw_row(place: _Place, pictures: dict[str, Array], columns: list[tuple[int
         x += w + GUTTER
 
 
-def _legends(place: _Place, shown: Sequence[Shown], top: float, y: int, width: int) -> None:
+def _legends(place: Place, shown: Sequence[Shown], top: float, y: int, width: int) -> None:
     """Colour bars below their columns, the colours of goals, and the caption."""
     x = GUTTER + INSET + GUTTER
     ramp = np.linspace(0, 1, 256)
     step = PANEL[0] + GUTTER
-    _bar(place, x + 90, y + 22, height_colors(ramp, 1), ["0", f"{top / 2:.2f}", f"{top:.2f}"], "height above the table, m")
+    heights = ["0", f"{top / 2:.2f}", f"{top:.2f}"]
+    place.bar(x + 90, y + 22, BAR, height_colors(ramp, 1), heights, "height above the table, m")
     place.text(x + step + PANEL[0] / 2, y + 28, "one colour per superpoint", size=10, color="#333", ha="center")
     labels = ["−1  keep away", "0", "place here  +1"]
-    _bar(place, x + 2 * step + 90, y + 22, affordance_colors(ramp * 2 - 1), labels, "placement affordance")
+    place.bar(x + 2 * step + 90, y + 22, BAR, affordance_colors(ramp * 2 - 1), labels, "placement affordance")
     reasons = Counter(int(reason) for item in shown for reason in item.sample["rejected_goals/reason"])
     entries = [(VALID, "valid goal"), (DEMONSTRATED, "demonstrated")]
     entries += [
@@ -291,11 +301,3 @@ def _legends(place: _Place, shown: Sequence[Shown], top: float, y: int, width: i
         "Goals: the true solids."
     )
     place.text(width / 2, y + FOOTER - 16, caption, size=9.5, color="#555", ha="center")
-
-
-def _bar(place: _Place, x: float, y: float, colors: Array, labels: list[str], name: str) -> None:
-    length = PANEL[0] - 180
-    place.axes(x, y, length, 12).imshow(colors[None], aspect="auto")
-    for share, label, align in zip((0, 0.5, 1), labels, ("left", "center", "right")):
-        place.text(x + share * length, y + 24, label, size=9, color="#333", ha=align)
-    place.text(x + length / 2, y - 10, name, size=10, color="#333", ha="center")

@@ -2,7 +2,8 @@
 
 Arrays: `demo` (N,) int, `rank` (N,) int (0 is the best of its demo), `T_world_object` (N, 4, 4) float, `score` (N,)
 float, and, if some rows have no pose, `status` (N,) text ("ok", or why there is none; such a row's pose is NaN).
-Rows may come in any order. A demo that has no row gets none of the success, and stays in every denominator.
+Rows may come in any order. A demo that has no row gets none of the success, and stays in every denominator. A judge
+that is told K judges the ranks below K; the modes are counted on all.
 """
 
 from __future__ import annotations
@@ -38,8 +39,12 @@ class Predictions:
     status: Array  # (N,) str
 
     def of(self, demo: int) -> Array:
-        """(K, 4, 4) poses of one demo that have status "ok", best first."""
+        """(C, 4, 4) poses of one demo that have status "ok", by rank."""
         return np.asarray(self.T_world_object[(self.demo == demo) & (self.status == "ok")])
+
+    def ranks(self, demo: int) -> Array:
+        """(C,) i8, the ranks of these poses, rising."""
+        return np.asarray(self.rank[(self.demo == demo) & (self.status == "ok")])
 
     @property
     def sha256(self) -> str:
@@ -50,12 +55,17 @@ class Predictions:
         return digest.hexdigest()
 
 
-def collect(placements: Mapping[int, Sequence[Placement]]) -> Predictions:
-    """Predictions from the placements of each demo, ranked by score; among equals the earlier one is better."""
+def collect(placements: Mapping[int, Sequence[Placement]], k: int | None = None) -> Predictions:
+    """Predictions from the placements of each demo, ranked by score; among equals the earlier one is better.
+
+    Args:
+        placements: By demo, in the order drawn.
+        k: The first so many of each demo are ranked, the others come after them as drawn; None: all are ranked.
+    """
     rows = [
         (demo, rank, placement)
         for demo, mine in sorted(placements.items())
-        for rank, placement in enumerate(sorted(mine, key=lambda p: (p.status != "ok", -p.score if p.status == "ok" else 0.0)))
+        for rank, placement in enumerate([*sorted(mine[:k], key=_worse), *(mine[k:] if k is not None else [])])
     ]
     poses = [np.asarray(p.T_world_object, float) if p.status == "ok" else np.full((4, 4), np.nan) for _, _, p in rows]
     return Predictions(
@@ -65,6 +75,11 @@ def collect(placements: Mapping[int, Sequence[Placement]]) -> Predictions:
         np.array([p.score if np.isfinite(p.score) else -1e9 for _, _, p in rows], float),
         np.array([p.status for _, _, p in rows], str),
     )
+
+
+def _worse(placement: Placement) -> tuple[bool, float]:
+    """Sorts placements best first, those without a pose last."""
+    return placement.status != "ok", -placement.score if placement.status == "ok" else 0.0
 
 
 def write(path: str | Path, predictions: Predictions) -> Path:

@@ -18,7 +18,7 @@ from pydantic import BaseModel, Field, SerializeAsAny, ValidationError, create_m
 
 from dapdata import keys, tasks
 from dapdata.cluster import SuperpointsConfig
-from dapdata.config import EvalConfig, SceneConfig, Section, SplitConfig, TrainConfig, key
+from dapdata.config import PAPER, EvalConfig, SceneConfig, Section, SplitConfig, TrainConfig, key
 from dapdata.errors import UsageError, hint
 from dapdata.labels import LabelConfig
 from dapdata.observe import CamerasConfig, NoiseConfig
@@ -64,8 +64,15 @@ def resolve(recipe: Recipe) -> dict[str, Any]:
 
 
 def from_resolved(resolved: dict[str, Any], overrides: Sequence[str] = (), origin: str = "manifest.json") -> Recipe:
-    """The recipe that `resolve` was given, with `a.b=value` overrides applied; errors point to `origin`."""
-    return _validate(Source(origin, json.loads(json.dumps(resolved))), overrides)
+    """The recipe that `resolve` was given, with `a.b=value` overrides applied; errors point to `origin`.
+
+    A resolved recipe has every key written, so that a `train.preset` among the overrides would change nothing: it takes
+    the place of the keys that it sets. Other overrides win over it.
+    """
+    tree = json.loads(json.dumps(resolved))
+    if any(override.partition("=")[0] == "train.preset" for override in overrides) and isinstance(tree.get("train"), dict):
+        tree["train"] = {name: value for name, value in tree["train"].items() if name not in PAPER}
+    return _validate(Source(origin, tree), overrides)
 
 
 @cache

@@ -50,20 +50,32 @@ class Success(Part):
     success_precise: Interval = Field(description="top-1 succeeds and ends within 5 mm and 3 degrees of the prediction")
     success_near_goal: Interval = Field(description="top-1 succeeds within 2 cm (surface distance) of a verified goal")
     success_tight: Interval = Field(
-        description="scenes that have a tight goal (clearance under 15 mm, or a stack top): top-1 succeeds within 2 cm of one"
+        description="scenes that have a tight goal (clearance under 15 mm, or a stack top): the best-ranked of the candidates "
+        "that head for one succeeds within 2 cm of it"
     )
+    success_top1_tight: Interval = Field(description="the same scenes: top-1, free to choose, succeeds within 2 cm of one")
     failures: dict[str, int] = Field(description="top-1 failures by reason, no_prediction among them")
     failures_all: dict[str, int] = Field(description="failures of all K candidates by reason")
 
 
+class LegacyRpdiff(Part):
+    """RPDiff's own coverage, to relate to its numbers and for nothing else: it takes 34.4 degrees for 5 and no symmetry."""
+
+    recall: Interval = Field(description="share of the goals with a candidate within 3.5 cm and 34.4 degrees")
+    precision: Interval = Field(description="share of the candidates within 4 cm and 34.4 degrees of a goal")
+
+
 class Modes(Part):
-    """How many of the verified goals the candidates find, by surface distance modulo symmetry."""
+    """How many of the verified goals the candidates find, by surface distance modulo symmetry; judged or not."""
 
     tau_mm: Quantiles = Field(description="tolerance of the goals: min(10 mm, half the clearance + 2 mm)")
     modes: Quantiles = Field(description="verified goals in a scene")
     recall_at_K: dict[str, Interval] = Field(alias="recall@K")
     uniform_recall_at_K: dict[str, float] = Field(
         alias="uniform_recall@K", description="the same for a uniform sampler of goals"
+    )
+    recall_share_at_K: dict[str, float] = Field(
+        alias="recall_share@K", description="mean recall over the mean of the uniform sampler's: 1 is as good as even draws"
     )
     all_modes_found_at_K: dict[str, Interval] = Field(alias="all_modes_found@K")
     uniform_all_modes_found_at_K: dict[str, float] = Field(alias="uniform_all_modes_found@K")
@@ -75,6 +87,7 @@ class Modes(Part):
     )
     entropy: Interval = Field(description="entropy over the modes of the matched candidates, 1 is even")
     uniform_entropy: float
+    legacy_rpdiff: LegacyRpdiff
 
 
 class Geometry(Part):
@@ -120,11 +133,12 @@ class Method(Part):
     """Who made the predictions, as far as it was told."""
 
     name: str
-    k: int = Field(ge=1)
+    k: int = Field(ge=1, description="candidates that are judged: those of rank 0 to k - 1")
+    draws: int = Field(ge=1, description="candidates that the modes are counted on: those that are judged, and others")
     saw_ground_truth: bool
     n_predicted: int = Field(ge=0, description="scenes with at least one pose")
     n_no_prediction: int = Field(ge=0)
-    n_candidates: int = Field(ge=0)
+    n_candidates: int = Field(ge=0, description="poses that were judged")
     settings: dict[str, Any] = Field(default_factory=dict)
 
 
@@ -169,7 +183,7 @@ class SceneRow(Part):
     successes: int
     candidates: int
     modes: int
-    modes_found: int
+    modes_found: int = Field(description="by all candidates, judged or not")
 
 
 class Report(Part):

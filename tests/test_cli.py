@@ -299,6 +299,28 @@ def test_train_then_predict_on_scans(tiny_dataset: Path, capsys: pytest.CaptureF
     assert run(capsys, "predict", "r", *scans, "-k", 3).count("\n") == 4
 
 
+def test_evaluating_takes_overrides_of_what_acts_at_inference(tiny_dataset: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("torch")
+    run(capsys, "train", tiny_dataset, "--run", "r", "--steps", 1)
+    options = ("--data", tiny_dataset, "--trials", 1, "-k", 1, "--draws", 2, "--split", "train", "--workers", 1)
+    found = printed(capsys, "eval", "r", *options, "--set", "train.refine=[]", "--set", "train.sample_steps=2", "--out", "o")
+    assert (found["method"]["settings"]["refine"], found["method"]["settings"]["sample_steps"]) == ([], 2)
+    assert (found["method"]["k"], found["method"]["draws"]) == (1, 2)
+    assert not Path("r/report.json").exists()
+    assert predictions.read("o/predictions.npz").rank.tolist() == [0, 1]
+    again = printed(capsys, "judge", "o/predictions.npz", "--data", tiny_dataset, "--split", "train", "--trials", 1, "-k", 1)
+    assert again["success"] == found["success"]
+    assert again["modes"] == found["modes"]
+    for wrong, says in (
+        ("train.width=32", "train.width: is fixed in training"),
+        ("train.refine=[jump]", "train.refine[0]: got 'jump'"),
+        ("label.eps_place=0.02", "expected a key of the train section"),
+    ):
+        run(capsys, "eval", "r", *options, "--set", wrong, code=2)
+        assert says in said()
+        assert said().count("\n") == 1
+
+
 def test_training_takes_overrides_of_its_own_section_only(tiny_dataset: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("torch")
     run(capsys, "train", tiny_dataset, "--run", "r", "--set", "label.eps_place=0.02", code=2)

@@ -85,6 +85,20 @@ def test_a_denoiser_that_knows_two_modes_gives_both_and_no_mixture():
     assert 0.44 < float((drawn[:, 0] > 0).double().mean()) < 0.56
 
 
+def test_the_way_of_a_sample_begins_with_noise_ends_with_it_and_says_how_much_noise_is_left():
+    modes = torch.tensor([[1.0, 1, -1, -1], [-1, -1, 1, 1]], dtype=torch.float64)
+    way = list(diffusion.walk(lambda noisy, t: modes[:1].expand_as(noisy), (500, 4), ALPHA_BAR, 5, normal(4)))
+    left = [t for t, _ in way]
+    assert left == [100, 75, 51, 26, 1, 0]
+    torch.testing.assert_close(way[0][1], normal(4)((500, 4)))
+    for t, s in way[1:-1]:  # what the forward process makes of the clean score in so many steps
+        kept = float(ALPHA_BAR[t - 1])
+        assert float((s - math.sqrt(kept) * modes[0]).std()) == pytest.approx(math.sqrt(1 - kept), rel=0.1)
+    torch.testing.assert_close(way[-1][1], modes[:1].expand(500, 4))
+    sample = diffusion.sample(lambda noisy, t: modes[:1].expand_as(noisy), (500, 4), ALPHA_BAR, 5, normal(4))
+    assert torch.equal(sample, way[-1][1])
+
+
 def test_sampling_visits_the_first_and_the_last_step():
     visited = []
     diffusion.sample(lambda noisy, t: visited.append(t) or noisy, (1,), ALPHA_BAR, 5, normal(0))

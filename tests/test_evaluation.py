@@ -145,3 +145,104 @@ def test_a_run_of_a_few_steps_is_evaluated_with_affordance_and_cost(tiny: Path, 
     assert (run / "report.json").exists()
     with pytest.raises(UsageError, match="--method dap"):
         evaluate(run, tiny, method="cap", say=quiet)
+
+
+@pytest.fixture(scope="module")
+def run(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of two steps on `tiny`."""
+    pytest.importorskip("torch")
+    from training_samples import TINY
+
+    from daptrain.loop import train
+
+    return train(tiny, tmp_path_factory.mktemp("runs") / "run", steps=2, device="cpu", config=TINY)
+
+
+def test_other_draws_change_what_is_known_of_modes_and_nothing_else(tiny: Path, run: Path, tmp_path: Path) -> None:
+    """The k candidates, their ranks and their success are those of an evaluation that draws no more than k."""
+    few, many = (
+        evaluate(
+            run, tiny, trials=2, split="train", k=2, draws=draws, device="cpu", out=tmp_path / str(draws), pictures=False,
+            say=quiet,
+        )
+        for draws in (2, 5)
+    )  # fmt: skip
+    assert (few["method"]["k"], few["method"]["draws"]) == (2, 2)
+    assert (many["method"]["k"], many["method"]["draws"]) == (2, 5)
+    assert few["success"] == many["success"]
+    assert few["geometry"] == many["geometry"]
+    assert list(many["modes"]["recall@K"]) == ["1", "2", "4", "5"]
+    for count in few["modes"]["recall@K"]:
+        assert few["modes"]["recall@K"][count] == many["modes"]["recall@K"][count]
+    one, other = (predictions.read(tmp_path / name / "predictions.npz") for name in ("2", "5"))
+    judged = other.rank < 2
+    np.testing.assert_array_equal(one.T_world_object, other.T_world_object[judged])
+    np.testing.assert_array_equal(one.score, other.score[judged])
+    for demo in np.unique(other.demo):
+        mine = other.demo == demo
+        assert other.rank[mine].tolist() == [0, 1, 2, 3, 4]
+        assert other.score[mine][0] >= other.score[mine][1]
+    assert many["cost"]["infer_s"]["n"] == 2
+
+
+def test_seconds_a_placement_are_those_of_the_k(tiny: Path, run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The other draws are made slow; the clock does not see it."""
+    import time
+
+    from daptrain.infer import Predictor
+
+    propose = Predictor.propose
+
+    def slow(*arguments, **options):
+        if options.get("drawn", 0):
+            time.sleep(2)
+        return propose(*arguments, **options)
+
+    monkeypatch.setattr(Predictor, "propose", slow)
+    cost = evaluate(
+        run,
+        tiny,
+        trials=1,
+        split="train",
+        k=2,
+        draws=3,
+        device="cpu",
+        references=False,
+        out=tmp_path,
+        pictures=False,
+        say=quiet,
+    )["cost"]
+    assert cost["infer_s"]["max"] < 1
+
+
+def test_baselines_draw_for_the_modes_too(tiny: Path, tmp_path: Path) -> None:
+    found = evaluate(
+        None, tiny, method="oracle", trials=2, split="train", k=1, draws=32, out=tmp_path, pictures=False, say=quiet
+    )
+    assert found["method"]["n_candidates"] == 2
+    assert found["modes"]["all_modes_found@K"]["32"]["value"] == 1
+    assert found["modes"]["recall_share@K"]["32"] > 1  # no luck in it
+    assert set(found["references"]["random"]["modes"]["recall@K"]) == {"1", "2", "4", "8", "16", "32"}
+
+
+def test_fewer_draws_than_candidates_are_refused(tiny: Path, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"draws: got 2, expected at least k \(4\)"):
+        evaluate(None, tiny, method="random", k=4, draws=2, out=tmp_path / "out", say=quiet)
+    assert not (tmp_path / "out").exists()
+
+
+def test_changes_are_in_the_settings_and_go_beside_the_run(tiny: Path, run: Path) -> None:
+    before = {path.name: path.read_bytes() for path in run.iterdir()}
+    changes = {"refine": ["gravity"], "ranking": []}
+    found = evaluate(
+        run, tiny, trials=1, split="train", k=2, changes=changes, references=False, device="cpu", pictures=False, say=quiet
+    )
+    settings = found["method"]["settings"]
+    assert (settings["refine"], settings["ranking"], settings["sample_steps"]) == (["gravity"], [], 5)
+    assert {path.name: path.read_bytes() for path in run.iterdir()} == before
+    beside = run.with_name("run-refine-gravity-ranking")
+    assert json.loads((beside / "report.json").read_text()) == found
+    with pytest.raises(UsageError, match=r"train\.width: is fixed in training"):
+        evaluate(run, tiny, changes={"width": 32}, device="cpu", say=quiet)
+    with pytest.raises(UsageError, match="method 'random' has no settings"):
+        evaluate(run, tiny, method="random", changes={"refine": []}, say=quiet)

@@ -13,7 +13,9 @@ pytest.importorskip("safetensors")
 from safetensors.torch import load_file  # noqa: E402
 from training_samples import RULE, TINY, make_sample  # noqa: E402
 
+from dapdata import rng, tasks  # noqa: E402
 from dapdata.errors import CheckpointError, UsageError  # noqa: E402
+from dapdata.records import Rejected  # noqa: E402
 from daptrain import checkpoint, loop  # noqa: E402
 from daptrain.prepare import prepare  # noqa: E402
 
@@ -160,6 +162,50 @@ def test_a_budget_is_known_to_be_spent(material, tmp_path):
     assert checkpoint.is_spent(tmp_path, "pose", None, 2.0)
     assert not checkpoint.is_spent(tmp_path, "pose", 4, None)
     assert not checkpoint.is_spent(tmp_path, "pose", None, 2.5)
+
+
+# Fewer demos -----------------------------------------------------------------------------------------------------
+
+
+def learned_from(monkeypatch, dataset, run, **changes):
+    """The demos that networks are trained on, without training them."""
+    seen = []
+    monkeypatch.setattr(loop, "fit_all", lambda budgets, material, *rest, **options: seen.append(material))
+    monkeypatch.setattr(loop, "draw_curves", lambda run: None)
+    loop.train(dataset, run, steps=1, device="cpu", config=TINY.model_copy(update=changes))
+    return seen[0]
+
+
+def test_fewer_demos_are_a_part_of_more_and_validation_stays(tiny_dataset, tmp_path, monkeypatch):
+    found = [learned_from(monkeypatch, tiny_dataset, tmp_path / str(n), demos=n) for n in (1, 2, None)]
+    clouds = [[example.inputs.container_points for example in material.train] for material in found]
+    assert [len(part) for part in clouds] == [1, 2, 3]
+    for part in clouds:
+        assert all(np.array_equal(a, b) for a, b in zip(part, clouds[-1]))
+    assert len({len(material.val) for material in found}) == 1
+
+
+@pytest.mark.parametrize("task", tasks.names())
+def test_the_first_demos_of_a_split_are_like_the_others(task):
+    """Demos come in the order of their numbers, and neither container nor object follows from the number."""
+    scenes = [tasks.load(task).sample_scene(tasks.load(task).Params(), rng.stream(0, "scene", demo)) for demo in range(40)]
+    scenes = [scene for scene in scenes if not isinstance(scene, Rejected)]
+    for name in ("container_instance", "object_instance"):
+        instances = [getattr(scene, name) for scene in scenes]
+        assert len(set(instances)) == len(scenes) > 20
+        assert 0.25 < np.mean(np.diff(np.array(instances, float)) > 0) < 0.75
+
+
+def test_more_demos_than_there_are_are_refused_before_anything_is_written(tiny_dataset, tmp_path):
+    with pytest.raises(UsageError, match=r"train\.demos: got 4, the train split of .* holds 3"):
+        loop.train(tiny_dataset, tmp_path / "run", steps=1, device="cpu", config=TINY.model_copy(update={"demos": 4}))
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_run_on_other_demos_is_another_run(run):
+    other = described()
+    other["train"] = {**other["train"], "demos": 2}
+    refused(lambda: checkpoint.start_run(run, other), "train.demos None, now it is 2")
 
 
 def test_a_run_leaves_weights_metrics_and_curves(material, tmp_path):

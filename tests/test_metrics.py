@@ -177,24 +177,30 @@ def test_affordance_that_marks_one_mode_is_pure_and_that_spans_two_is_not() -> N
 # Summaries -------------------------------------------------------------------------------------------------
 
 
-def result(demo: int, successes: list[bool], distance: list[list[float]], tight: bool = True) -> metrics.SceneResult:
+def result(
+    demo: int, successes: list[bool], distance: list[list[float]], tight: bool = True, rank: list[int] | None = None
+) -> metrics.SceneResult:
+    """A scene by hand: verdicts of the first candidates, distances (m) of all, whose ranks are given or have no gap."""
     verdicts = [Verdict(ok, "ok" if ok else "pushed", np.eye(4), 0.001, 0.01, 0.0, 0.0005, 0.0) for ok in successes]
-    modes = len(distance[0]) if distance else 2
+    modes, number = len(distance[0]) if distance else 2, len(distance)
+    apart = np.array(distance, float).reshape(number, modes)
     return metrics.SceneResult(
         demo,
-        np.tile(np.eye(4), (len(successes), 1, 1)),
+        np.tile(np.eye(4), (number, 1, 1)),
         verdicts,
-        np.array(distance, float).reshape(len(successes), modes),
-        np.full((len(successes), 2), 0.01),
+        apart,
+        np.full((number, 2), 0.01),
         np.full(modes, 0.01),
         np.full(modes, tight),
         0.1,
+        np.arange(number) if rank is None else np.array(rank),
+        np.stack([apart < 0.035, apart < 0.04]),
     )
 
 
 def test_a_scene_without_prediction_is_a_failure_in_every_rate() -> None:
     results = [result(0, [True, False], [[0.001, 0.1], [0.1, 0.001]]), result(1, [], [])]
-    summary = metrics.summarise(results, 2)
+    summary = metrics.summarise(results, 2, 2)
     for name in ("success_top1", "success_any_of_K", "success_precise", "success_near_goal", "success_tight"):
         assert getattr(summary.success, name).value == 0.5
         assert getattr(summary.success, name).n == 2
@@ -205,15 +211,105 @@ def test_a_scene_without_prediction_is_a_failure_in_every_rate() -> None:
     assert summary.modes.recall_at_K["2"].value == 0.5
     assert summary.modes.all_modes_found_at_K["2"].value == 0.5
     assert summary.modes.precision_at_K["2"].value == 0.5
+    assert summary.modes.recall_share_at_K == {"1": 0.25 / 0.5, "2": 0.5 / 0.75}
+    assert summary.modes.legacy_rpdiff.recall.value == summary.modes.legacy_rpdiff.precision.value == 0.5
     assert summary.geometry.collision_free.value == 0.5
 
 
 def test_success_far_from_every_goal_is_not_near_a_goal() -> None:
-    summary = metrics.summarise([result(0, [True], [[0.03, 0.1]])], 1)
+    summary = metrics.summarise([result(0, [True], [[0.03, 0.1]])], 1, 1)
     assert summary.success.success_top1.value == 1
     assert summary.success.success_near_goal.value == summary.success.success_tight.value == 0
     assert summary.modes.sweep_mm["20"]["recall"] == 0
     assert summary.modes.sweep_mm["35"]["recall"] == 0.5
+
+
+def test_success_at_tight_goals_is_of_the_best_candidate_that_heads_for_one() -> None:
+    """Goal 0 is roomy, goal 1 is tight. Ranked first is the roomy one; what counts is how the first at the tight one does."""
+
+    def figures(successes: list[bool], distance: list[list[float]]) -> tuple[float, float]:
+        scene = replace(result(0, successes, distance), tight=np.array([False, True]))
+        success = metrics.summarise([scene], len(successes), len(successes)).success
+        return success.success_tight.value, success.success_top1_tight.value
+
+    roomy, tight, beside = [0.001, 0.1], [0.1, 0.001], [0.1, 0.03]
+    assert figures([True, True], [roomy, tight]) == (1, 0)
+    assert figures([True, True], [tight, roomy]) == (1, 1)
+    assert figures([True, False, True], [roomy, tight, tight]) == (0, 0)  # the second at the tight goal comes too late
+    assert figures([True, True], [roomy, beside]) == (0, 0)  # heads for it and does not get there
+    assert figures([True, True], [roomy, roomy]) == (0, 0)  # no candidate heads for it
+
+
+def test_success_is_of_the_judged_and_modes_are_of_all_that_were_drawn() -> None:
+    """Four candidates, of which two are judged: the first mode is found by the first, the others by those not judged."""
+    far = 0.1
+    distance = [[0.001, far, far], [far, far, far], [far, 0.001, far], [far, far, 0.001]]
+    summary = metrics.summarise([result(0, [False, True], distance)], 2, 4)
+    assert summary.success.success_top1.value == 0
+    assert summary.success.success_any_of_K.value == 1
+    assert summary.success.success_mean_of_K.value == 0.5
+    assert {k: v.value for k, v in summary.modes.recall_at_K.items()} == pytest.approx({"1": 1 / 3, "2": 1 / 3, "4": 1})
+    assert summary.modes.precision_at_K["4"].value == 0.75
+    assert summary.modes.all_modes_found_at_K["4"].value == 1
+    assert summary.modes.entropy.value == pytest.approx(1)
+    assert summary.modes.uniform_recall_at_K["4"] == pytest.approx(matching.uniform_recall(3, 4))
+    assert summary.modes.recall_share_at_K["4"] == pytest.approx(1 / matching.uniform_recall(3, 4))
+    assert summary.modes.sweep_mm["10"] == {"recall": 1, "all_modes_found": 1, "precision": 0.75}
+
+
+def test_a_candidate_without_a_pose_keeps_its_place_in_the_order() -> None:
+    """Rank 0 and rank 3 found a mode each; ranks 1 and 2 have no pose and find nothing."""
+    summary = metrics.summarise([result(0, [True], [[0.001, 0.1], [0.1, 0.001]], rank=[0, 3])], 2, 4)
+    assert {k: v.value for k, v in summary.modes.recall_at_K.items()} == {"1": 0.5, "2": 0.5, "4": 1}
+    assert {k: v.value for k, v in summary.modes.precision_at_K.items()} == {"1": 1, "2": 0.5, "4": 0.5}
+    assert summary.success.failures_all == {"no_prediction": 1}
+
+
+def test_recall_share_is_of_means_and_not_the_mean_of_shares() -> None:
+    one, three = result(0, [True], [[0.001]]), result(1, [True], [[0.1, 0.1, 0.1]])
+    modes = metrics.summarise([one, three], 1, 1).modes
+    assert modes.recall_share_at_K["1"] == pytest.approx(((1 + 0) / 2) / ((1 + 1 / 3) / 2))
+
+
+# RPDiff's coverage -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("shift", "degrees", "recall", "precision"),
+    [
+        (0.0, 0.0, True, True),
+        (0.0, 34.0, True, True),  # "5 degrees"
+        (0.0, 34.7, False, False),
+        (0.0, -34.0, True, True),
+        (0.034, 20.0, True, True),
+        (0.036, 0.0, False, True),
+        (0.039, 34.0, False, True),
+        (0.041, 0.0, False, False),
+    ],
+)
+def test_legacy_rpdiff_takes_34_degrees_for_5(shift: float, degrees: float, recall: bool, precision: bool) -> None:
+    goal = some_poses(3, 1)
+    axis = random_rotation(np.random.default_rng(4))[:, 0]
+    predicted = pose(translation=shift * axis) @ goal @ pose(rotation_about(axis, np.deg2rad(degrees)))
+    assert matching.legacy_rpdiff(predicted, goal).ravel().tolist() == [recall, precision]
+
+
+def test_legacy_rpdiff_misses_a_symmetric_copy_that_is_at_the_goal() -> None:
+    goal = some_poses(5, 1)
+    for kind, turn in (("box", pose(rotation_about((1, 0, 0), np.pi))), ("revolution", pose(rotation_about(Z, 1.5)))):
+        copy = goal @ turn
+        assert not matching.legacy_rpdiff(copy, goal).any()
+        assert matching.surface_distance(copy, goal, points_of(kind), kind, Z)[0, 0] < 1e-7
+
+
+def test_legacy_rpdiff_counts_goals_and_predictions() -> None:
+    """Two predictions at the first of three goals and none at the others, where one of them is turned by 90 degrees."""
+    goals = np.stack([pose(translation=(x, 0, 0)) for x in (0.0, 0.2, 0.4)])
+    predicted = np.stack([goals[0], pose(translation=(0.03, 0, 0)), goals[1] @ pose(rotation_about(Z, np.pi / 2))])
+    recall, precision = matching.legacy_rpdiff(predicted, goals)
+    assert recall.any(axis=0).tolist() == [True, False, False]
+    assert precision.any(axis=1).tolist() == [True, True, False]
+    assert matching.legacy_rpdiff(np.zeros((0, 4, 4)), goals).shape == (2, 0, 3)
 
 
 # The predictions file --------------------------------------------------------------------------------------
@@ -236,6 +332,19 @@ def test_predictions_come_back_as_written_ranked_by_score(tmp_path: Path) -> Non
     assert back.of(4) == pytest.approx(some_poses(0, 3)[[1, 2, 0]])
     assert back.of(2).shape == back.of(99).shape == (0, 4, 4)
     assert back.sha256 == made.sha256
+
+
+def test_the_first_k_are_ranked_and_the_others_stay_as_drawn() -> None:
+    T = some_poses(0, 5)
+    drawn = [Placement(T, score, "ok") for T, score in zip(T, (0.1, 0.9, 0.2, 0.5, 0.8))]
+    drawn[0] = Placement(np.full((4, 4), np.nan), -np.inf, "no_region")
+    made = predictions.collect({7: drawn}, k=3)
+    assert made.rank.tolist() == [0, 1, 2, 3, 4]
+    assert made.score.tolist() == [0.9, 0.2, -1e9, 0.5, 0.8]
+    assert made.status.tolist() == ["ok", "ok", "no_region", "ok", "ok"]
+    assert made.of(7) == pytest.approx(T[[1, 2, 3, 4]])
+    assert made.ranks(7).tolist() == [0, 1, 3, 4]
+    assert predictions.collect({7: drawn}).score.tolist() == [0.9, 0.8, 0.5, 0.2, -1e9]
 
 
 def hostile(name: str) -> dict[str, Any]:
@@ -354,6 +463,29 @@ def test_predictions_for_a_whole_split_are_judged_on_its_first_scenes_too(tiny: 
     assert report["split"]["n_scenes"] == report["method"]["n_candidates"] == 2
 
 
+def test_ranks_from_k_on_count_for_the_modes_alone(tiny: Path, tmp_path: Path) -> None:
+    """Rank 0 is far off, rank 1 has no pose, the goals follow: with k = 2 they are found, and nothing succeeds."""
+    dataset = loading.open(tiny)
+    sample = dataset[0]
+    demo, goals = int(sample["meta/demo"]), sample["goals/T_world_object"]
+    away = Placement(pose(translation=(9.0, 9.0, 9.0)), 2.0, "ok")
+    none = Placement(np.full((4, 4), np.nan), -np.inf, "no_region")
+    drawn = [away, none, *(Placement(T, 1.0, "ok") for T in goals)]
+    path = predictions.write(tmp_path / "p.npz", predictions.collect({demo: drawn}, k=2))
+    few, all_ = (metrics.judge_file(path, dataset, trials=1, split="train", k=k) for k in (2, None))
+    draws = 2 + len(goals)
+    assert (few["method"]["k"], few["method"]["draws"], few["method"]["n_candidates"]) == (2, draws, 1)
+    assert few["success"]["success_any_of_K"]["value"] == 0
+    assert few["success"]["failures_all"]["no_prediction"] == 1
+    assert few["modes"]["recall@K"]["2"]["value"] == 0
+    assert few["modes"]["recall@K"][str(draws)]["value"] == 1
+    assert few["scenes"][0]["modes_found"] == len(goals)
+    assert few["references"]["oracle"]["modes"]["recall@K"][str(draws)]["value"] == 1
+    assert all_["method"]["k"] == all_["method"]["draws"] == draws
+    assert all_["success"]["success_any_of_K"]["value"] == 1
+    assert all_["modes"] == few["modes"]
+
+
 def test_two_processes_judge_as_one(tiny: Path) -> None:
     dataset = loading.open(tiny)
     samples = [dataset[i] for i in range(3)]
@@ -382,7 +514,7 @@ def test_a_judge_that_fails_its_oracle_says_so(tiny: Path) -> None:
 
 def test_every_failure_a_report_can_name_is_in_the_docs() -> None:
     text = (Path(__file__).parents[1] / "docs/metrics.md").read_text()
-    for model in (report.Success, report.Modes, report.Geometry, report.Affordance, report.Cost):
+    for model in (report.Success, report.Modes, report.LegacyRpdiff, report.Geometry, report.Affordance, report.Cost):
         for name, field in model.model_fields.items():
             assert f"`{field.alias or name}`" in text, name
 

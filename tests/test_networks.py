@@ -116,7 +116,9 @@ def test_clean_region_drops_strays_and_names_nothing_when_nothing_is_likely():
 
 def test_a_crop_holds_the_region_and_little_else(examples):
     inputs, score = examples[0].inputs, examples[0].targets.affordance[0]
-    piece = prepare.crop(inputs, score, RULE.eps_place, 0.0, TINY, np.random.default_rng(0))
+    region = prepare.one_region(inputs, score, RULE.eps_place)
+    assert region is not None
+    piece = prepare.crop(inputs, score, region, 0.0, TINY, np.random.default_rng(0))
     assert piece is not None
     assert np.linalg.norm(piece.points, axis=1).max() < np.linalg.norm(SIZE) / 2 + 3 * RULE.eps_place
     goal = examples[0].targets.T_front_object[0][:3, 3]
@@ -230,6 +232,23 @@ def test_peaks_come_best_first_and_apart():
     assert len(affordance.peaks(score, places, 9, 0.1)) == 3
 
 
+@pytest.mark.parametrize(
+    ("p", "positive"),
+    [
+        ([0.9, 0.6, 0.45, 0.1], [1, 1, 0, 0]),  # above 0.5, as published
+        ([0.51, 0.49, 0.3, 0.3], [1, 0, 0, 0]),
+        ([0.4, 0.3, 0.19, 0.0], [1, 1, 0, 0]),  # four places share it: above half of the maximum
+        ([0.06, 0.04, 0.02, 0.0], [1, 1, 0, 0]),
+        ([0.0, 0.0, 0.0, 0.0], [0, 0, 0, 0]),
+        ([np.nan, 0.9, 0.9, 0.9], [0, 0, 0, 0]),
+    ],
+)
+def test_what_a_classification_calls_positive(p, positive):
+    score = affordance.positives(2 * np.array(p) - 1)
+    np.testing.assert_array_equal(score > 0, np.array(positive, bool))
+    assert not (np.abs(score) > 1).any()
+
+
 def test_the_paper_preset_has_no_extension():
     net = AffordanceNet(TrainConfig(preset="paper"))
     assert net.embed_extents is None
@@ -240,7 +259,7 @@ def test_the_paper_preset_has_no_extension():
 
 def test_a_written_key_wins_over_the_preset():
     config = TrainConfig(preset="paper", prediction="x0")
-    assert (config.prediction, config.goals, config.refine) == ("x0", "demonstrated", False)
+    assert (config.prediction, config.goals, config.refine) == ("x0", "demonstrated", [])
 
 
 # Net 2 ----------------------------------------------------------------------------------------------------------

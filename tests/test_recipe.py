@@ -12,6 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from dapdata import keys, recipe, tasks
+from dapdata.config import PAPER
 from dapdata.errors import RecipeError, UsageError
 
 SCENE = "scene:\n  task: can_cabinet\n"
@@ -222,3 +223,16 @@ def test_one_wrong_thing_in_a_valid_recipe_is_found_with_its_key_and_line(
     for line in lines:
         number = int(line.split(":")[1])
         assert str(path[-1]) in text.split("\n")[number - 1]
+
+
+def test_a_preset_asked_of_a_dataset_takes_the_place_of_the_keys_it_sets() -> None:
+    """`dapdata train DATASET --set train.preset=paper`: the dataset's recipe has every key written."""
+    resolved = recipe.resolve(recipe.from_resolved({"scene": {"task": "can_cabinet"}, "train": {"width": 32}}))
+    asked = recipe.from_resolved(resolved, ["train.sample_steps=7", "train.preset=paper"]).train
+    assert {name: getattr(asked, name) for name in PAPER} == PAPER | {"sample_steps": 7}
+    assert asked.width == 32
+    back = recipe.from_resolved(
+        recipe.resolve(recipe.from_resolved(resolved, ["train.preset=paper"])), ["train.preset=default"]
+    )
+    assert recipe.resolve(back) == resolved
+    assert recipe.from_resolved(resolved, ["train.mirror=false"]).train.prediction == "x0"

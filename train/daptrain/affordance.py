@@ -15,6 +15,7 @@ Beyond the paper, each with its switch and all off in `preset: paper`:
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,7 +25,7 @@ from torch.nn import functional
 
 from dapdata.config import TrainConfig
 from daptrain import diffusion
-from daptrain.layers import UNIT, DiTBlock, FourierPosition, Neighbours, PointEncoder, TimeToken, gather
+from daptrain.layers import UNIT, DiTBlock, FourierPosition, Neighbours, PointEncoder, TimeToken, exact, gather, halved
 from daptrain.prepare import Array, Inputs
 
 CHANNELS = 8  # position 3, normal 3, height 1, log size 1
@@ -96,7 +97,8 @@ class AffordanceNet(nn.Module):
         # The background of a score is -1: what is left above it is evidence for a region.
         above = noisy + self.alpha_bar[t].sqrt().float()[..., None]
         above = above.masked_fill(~encoded.mask[:, None], 0.0)
-        smooth = torch.einsum("brst,blt->blsr", encoded.smoothing, above)  # (B, L, S, R)
+        with exact(noisy.device):
+            smooth = torch.einsum("brst,blt->blsr", encoded.smoothing, above)  # (B, L, S, R)
         score = self.embed_score(torch.cat((noisy[..., None], smooth), dim=-1))
         x = (encoded.tokens[:, None] + score).flatten(0, 1)
         condition = self.time(t.flatten()) + encoded.condition.repeat_interleave(L, dim=0)
@@ -176,20 +178,28 @@ def loss(net: AffordanceNet, batch: SuperpointBatch, clean: Tensor, t: Tensor, n
         t: (B, L) steps.
         noise: (B, L, S) standard normal.
     """
-    encoded = net.encode(batch)
     if net.method == "cap":
         t, noisy = torch.zeros_like(t), torch.zeros_like(clean)
     else:
         noisy = diffusion.add_noise(clean, net.alpha_bar[t].float()[..., None], noise)
-    out = net(encoded, noisy, t)
+    with halved(clean.device):
+        out = net(net.encode(batch), noisy, t).float()
     if net.predicts_logits:
         return masked_mean(functional.binary_cross_entropy_with_logits(out, (clean + 1) / 2, reduction="none"), batch.mask)
     return masked_mean((out - noise).square(), batch.mask)
 
 
-@torch.no_grad()
 def sample(net: AffordanceNet, batch: SuperpointBatch, count: int, steps: int, rng: np.random.Generator) -> Array:
-    """(B, count, S) sampled scores in [-1, 1]; with `method: cap`, the one classification, repeated.
+    """(B, count, S) sampled scores in [-1, 1]; with `method: cap`, the one classification, repeated."""
+    *_, (_, last) = walk(net, batch, count, steps, rng)
+    return np.asarray(last.clamp(-1, 1).cpu())
+
+
+@torch.no_grad()
+def walk(
+    net: AffordanceNet, batch: SuperpointBatch, count: int, steps: int, rng: np.random.Generator
+) -> Iterator[tuple[int, Tensor]]:
+    """(B, count, S) scores on their way from noise to a sample, as `diffusion.walk` gives them; `cap` has the last alone.
 
     The noise comes from numpy, so that a sample is the same on every device.
     """
@@ -203,8 +213,9 @@ def sample(net: AffordanceNet, batch: SuperpointBatch, count: int, steps: int, r
         return net.clean(encoded, noisy, torch.full((B, count), step, device=noisy.device))
 
     if net.method == "cap":
-        return np.asarray(denoise(batch.points.new_zeros(B, count, S), 0).cpu())
-    return np.asarray(diffusion.sample(denoise, (B, count, S), net.alpha_bar, steps, noise).clamp(-1, 1).cpu())
+        yield 0, denoise(batch.points.new_zeros(B, count, S), 0)
+        return
+    yield from diffusion.walk(denoise, (B, count, S), net.alpha_bar, steps, noise)
 
 
 def peaks(score: Array, superpoints: Array, count: int, reach: float) -> list[Array]:
@@ -225,3 +236,18 @@ def peaks(score: Array, superpoints: Array, count: int, reach: float) -> list[Ar
         found.append(np.where(near, 2 * np.minimum(p / max(p[peak], 1e-6), 1) - 1, -1.0))
         left &= ~near
     return found
+
+
+def positives(score: Array) -> Array:
+    """(S,) score in [-1, 1] that is above 0 on all that a classification calls positive, over however many modes.
+
+    As published, that is where its probability is above 0.5. Where several places are as likely it may be above 0.5
+    nowhere, since they share it; then half of its maximum takes the place of 0.5. That is the kinder reading: by the
+    other one nothing would be left to crop.
+
+    Args:
+        score: (S,) in [-1, 1].
+    """
+    p = np.clip((score + 1) / 2, 0, 1)
+    threshold = 0.5 if p.max() > 0.5 else max(float(p.max()) / 2, 1e-6)
+    return np.asarray(np.minimum(p / threshold - 1, 1))

@@ -24,7 +24,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save as to_bytes
 from torch import Tensor
 
-from dapdata.config import TrainConfig
+from dapdata.config import AT_INFERENCE, TrainConfig
 from dapdata.errors import CheckpointError, UsageError
 from daptrain.affordance import AffordanceNet
 from daptrain.pose import PoseNet
@@ -37,7 +37,7 @@ FORMAT = "dapdata-run-1"
 NETS: dict[str, type[AffordanceNet] | type[PoseNet]] = {"affordance": AffordanceNet, "pose": PoseNet}
 WORST = -1e9  # score before the first validation
 # Keys that do not change what is learned: a run may go on, or be used, with other values.
-FREE_KEYS = {"preset", "minutes", "affordance_share", "refine", "ranking", "sample_steps"}
+FREE_KEYS = {"preset", "minutes", "affordance_share", *AT_INFERENCE} - {"crop_margin"}
 
 
 @dataclass

@@ -11,7 +11,7 @@ The variance is the posterior's; the paper's sigma_t^2 = beta_t is the other DDP
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import torch
@@ -53,7 +53,17 @@ def posterior(noisy: Tensor, clean: Tensor, alpha_bar_now: float, alpha_bar_befo
 
 
 def sample(denoise: Denoiser, shape: tuple[int, ...], alpha_bar: Tensor, steps: int, noise: Noise) -> Tensor:
-    """Scores drawn by walking back from pure noise.
+    """Scores drawn by walking back from pure noise; arguments as in `walk`."""
+    *_, (_, last) = walk(denoise, shape, alpha_bar, steps, noise)
+    return last
+
+
+def walk(
+    denoise: Denoiser, shape: tuple[int, ...], alpha_bar: Tensor, steps: int, noise: Noise
+) -> Iterator[tuple[int, Tensor]]:
+    """The scores on their way, each with the number of noising steps that are left in them.
+
+    Pure noise comes first, with T; the sample comes last, with 0.
 
     Args:
         denoise: Estimates the clean scores in [-1, 1] at a step.
@@ -65,9 +75,10 @@ def sample(denoise: Denoiser, shape: tuple[int, ...], alpha_bar: Tensor, steps: 
     T = len(alpha_bar)
     visited = np.unique(np.linspace(0, T - 1, min(steps, T)).round().astype(int))[::-1] if steps > 1 else np.array([T - 1])
     s = noise(shape)
+    yield T, s
     for i, t in enumerate(visited):
         before = float(alpha_bar[visited[i + 1]]) if i + 1 < len(visited) else 1.0
         s, variance = posterior(s, denoise(s, int(t)), float(alpha_bar[t]), before)
         if variance > 0:
             s = s + math.sqrt(variance) * noise(shape)
-    return s
+        yield (int(visited[i + 1]) + 1 if i + 1 < len(visited) else 0), s

@@ -38,6 +38,7 @@ Sample = dict[str, Array]
 Say = Callable[[str], None]
 
 LEARNED = ("dap", "cap")
+UNREADABLE = "unreadable_cloud"  # status of a scene whose clouds the networks cannot be given
 SAY_EVERY = 5.0  # s between lines
 
 
@@ -60,6 +61,8 @@ def evaluate(
     protocol: metrics.Protocol | None = None,
     method: str = "dap",
     k: int | None = None,
+    draws: int | None = None,
+    changes: Mapping[str, Any] | None = None,
     references: bool = True,
     device: str = "auto",
     workers: int = 1,
@@ -76,36 +79,44 @@ def evaluate(
         trials: How many of them; default: the recipe's. The first ones of the split, in order.
         protocol: "strict" or "rpdiff"; default: the recipe's.
         method: dap, cap, oracle, random or heuristic.
-        k: Candidates for each demo; default: the recipe's.
+        k: Candidates for each demo that are ranked and judged; default: the recipe's.
+        draws: Candidates for each demo that the modes are counted on, at least k: the k, then others, which are refined
+            but neither ranked nor judged. Default: the recipe's, and no fewer than k.
+        changes: Of the run's train config, for this evaluation alone: other values for keys of config.AT_INFERENCE.
         references: Judge oracle, heuristic and random too. The oracle is always judged.
         device: Of the networks.
         workers: Processes that judge.
-        out: Folder for what is written; default: the run, or runs/<method>-<dataset>.
+        out: Folder for what is written; default: the run, beside it with changes, or runs/<method>-<dataset>.
         pictures: Put pictures of some successes and of each failure into report.html.
         say: Gets a line now and then; default: stderr.
 
     Raises:
-        UsageError: an unknown method, no run where one is needed, a split without demos.
+        UsageError: an unknown method, no run where one is needed, a split without demos, fewer draws than k, a change of
+            what is fixed in training.
         CheckpointError: a run of another task, or none.
         CorruptionError: the recorded goals fail before this judge; the report is written first.
     """
     say = _seldom(say or (lambda line: print(line, file=sys.stderr, flush=True)))
-    predictor = _load(run, method, device)
-    dataset = loading.open(data if data is not None else _data_of(run), split)
+    predictor = _load(run, method, device, changes or {})
+    dataset = loading.open(data if data is not None else data_of(run), split)
     config = EvalConfig.model_validate(dataset.recipe.get("eval", {}))
     trials, k, protocol = trials or config.trials, k or config.k, protocol or config.protocol
+    if draws is not None and draws < k:
+        raise UsageError(f"draws: got {draws}, expected at least k ({k}): what is judged was drawn; give more, or a smaller k")
+    draws = draws or max(k, config.draws or k)
     if len(dataset) == 0:
         raise UsageError(f"{dataset.root}: split '{split}': got 0 demos, expected at least 1; choose another split")
     if predictor is not None and predictor.task != dataset.task:
         raise UsageError(f"{run}: was trained on task {predictor.task}, the data are of task {dataset.task}; give its own data")
-    folder = Path(out or run or Path("runs") / f"{method}-{dataset.root.resolve().name}")
+    folder = Path(out) if out is not None else _folder(run, method, dataset, changes or {})
     folder.mkdir(parents=True, exist_ok=True)
+    say(f"report: {folder / 'report.html'}")
     samples = [dataset[i] for i in range(min(trials, len(dataset)))]
     seed = int(dataset.recipe["seed"])
 
-    others = {name: _guess(name, samples, k, seed, say) for name in baselines.NAMES} if references else {}
-    mine = _guess(method, samples, k, seed, say) if predictor is None else _predict(predictor, samples, k, seed, say)
-    path = predictions.write(folder / "predictions.npz", predictions.collect(mine.placements))
+    others = {name: _guess(name, samples, draws, seed, say) for name in baselines.NAMES} if references else {}
+    mine = _predict(predictor, samples, k, draws, seed, say) if predictor else _guess(method, samples, draws, seed, say)
+    path = predictions.write(folder / "predictions.npz", predictions.collect(mine.placements, k))
     report, results = metrics.judge_dataset(
         predictions.read(path),
         dataset,
@@ -117,7 +128,7 @@ def evaluate(
         saw_ground_truth=predictor is None,
         settings=predictor.config.model_dump(mode="json") if predictor is not None else {},
         weights=_weights(run if predictor else None),
-        references={name: predictions.collect(other.placements) for name, other in others.items()},
+        references={name: predictions.collect(other.placements, k) for name, other in others.items()},
         affordance=mine.affordance,
         cost=_cost(mine, predictor, run, dataset),
         seed=seed,
@@ -125,7 +136,8 @@ def evaluate(
         origin=str(path),
         progress=say,
     )
-    _write(folder, report, results[method], samples, pictures, say)
+    film = _film(predictor, samples, mine, seed, say) if pictures else None
+    _write(folder, report, results[method], samples if pictures else [], film, say)
     metrics.require_sound(report)
     return report.model_dump(mode="json", by_alias=True)
 
@@ -133,54 +145,66 @@ def evaluate(
 # Predicting ------------------------------------------------------------------------------------------------
 
 
-def _guess(name: str, samples: Sequence[Sample], k: int, seed: int, say: Say) -> Proposals:
-    """The placements of a baseline."""
+def _guess(name: str, samples: Sequence[Sample], draws: int, seed: int, say: Say) -> Proposals:
+    """The placements of a baseline, in the order drawn."""
     place, found = baselines.load(name), Proposals()
     for i, sample in enumerate(samples):
         demo = int(sample["meta/demo"])
         start = time.perf_counter()
-        found.placements[demo] = place(sample, k, rngs.stream(seed, f"eval/{name}", demo))
-        found.infer_s.append((time.perf_counter() - start) / k)
+        found.placements[demo] = place(sample, draws, rngs.stream(seed, f"eval/{name}", demo))
+        found.infer_s.append((time.perf_counter() - start) / draws)
         say(f"{name}: predicted {i + 1} of {len(samples)} scenes")
     return found
 
 
-def _predict(predictor: Predictor, samples: Sequence[Sample], k: int, seed: int, say: Say) -> Proposals:
-    """The placements of the trained networks. A scene that they cannot read gets a status, not an exception."""
+def _predict(predictor: Predictor, samples: Sequence[Sample], k: int, draws: int, seed: int, say: Say) -> Proposals:
+    """The placements of the trained networks, in the order drawn, the k before the others.
+
+    A scene that they cannot read gets a status, not an exception.
+    """
     found = Proposals(affordance={})
     for i, sample in enumerate(samples):
         demo = int(sample["meta/demo"])
         try:
-            _predict_one(predictor, sample, k, rngs.stream(seed, f"eval/{predictor.method}", demo), found)
+            _predict_one(predictor, sample, k, draws, rngs.stream(seed, f"eval/{predictor.method}", demo), found)
         except UsageError:
-            found.placements[demo] = [Placement(np.full((4, 4), np.nan), -np.inf, "unreadable_cloud")]
+            found.placements[demo] = [Placement(np.full((4, 4), np.nan), -np.inf, UNREADABLE)]
         say(f"{predictor.method}: predicted {i + 1} of {len(samples)} scenes")
     return found
 
 
-def _predict_one(predictor: Predictor, sample: Sample, k: int, rng: np.random.Generator, found: Proposals) -> None:
-    """Adds one scene: `Predictor.predict`, with a clock and with the sampled scores at hand."""
+def _predict_one(predictor: Predictor, sample: Sample, k: int, draws: int, rng: np.random.Generator, found: Proposals) -> None:
+    """Adds one scene: `Predictor.predict` of k, with a clock and with the sampled scores at hand; then the other draws."""
     from daptrain.infer import check_cloud
 
     container, object_ = ((sample[f"{body}/points"], sample[f"{body}/normals"]) for body in ("container", "object"))
     check_cloud("container", *container)
     check_cloud("object", *object_)
     start = time.perf_counter()
-    inputs = predictor.prepare(*container, *object_, rng=rng)
+    inputs, box = predictor.prepare(*container, *object_, rng=rng)
     ready = time.perf_counter()
     proposals = predictor.propose(inputs, k, rng)
-    T_world_box, scores = predictor.finish(proposals, *container, *object_)
+    T_world_box, scores = predictor.finish(proposals, *container, box)
     done = time.perf_counter()
-    T_world_object = T_world_box @ inverse(inputs.T_world_box) @ sample["pose/T_world_object_start"]
+    T_box_object = inverse(inputs.T_world_box) @ sample["pose/T_world_object_start"]
     demo = int(sample["meta/demo"])
-    found.placements[demo] = [
-        Placement(T, float(score), "ok") if p.status == "ok" else Placement(np.full((4, 4), np.nan), -np.inf, p.status)
-        for T, score, p in zip(T_world_object, scores, proposals)
-    ]
+    found.placements[demo] = _placements(proposals, T_world_box @ T_box_object, scores)
+    if draws > k:  # neither ranked nor judged, and so not on the clock
+        more = predictor.propose(inputs, draws - k, rng, drawn=k)
+        T_world_box, scores = predictor.finish(more, *container, box)
+        found.placements[demo] += _placements(more, T_world_box @ T_box_object, scores)
     found.prepare_s.append((ready - start) / k)
     found.infer_s.append((done - ready) / k)
     assert found.affordance is not None
     found.affordance[demo] = _affordance_quality(predictor, inputs, sample, proposals)
+
+
+def _placements(proposals: Sequence[Proposal], T_world_object: Array, scores: Array) -> list[Placement]:
+    """The proposals with their poses (K, 4, 4) and scores (K,); where there is no pose, its status says why."""
+    return [
+        Placement(T, float(score), "ok") if p.status == "ok" else Placement(np.full((4, 4), np.nan), -np.inf, p.status)
+        for T, score, p in zip(T_world_object, scores, proposals)
+    ]
 
 
 def _affordance_quality(
@@ -199,9 +223,11 @@ def _affordance_quality(
     return [affordance_quality(proposal.score, regions) for proposal in proposals]
 
 
-def _load(run: str | Path | None, method: str, device: str) -> Predictor | None:
+def _load(run: str | Path | None, method: str, device: str, changes: Mapping[str, Any]) -> Predictor | None:
     """The networks of the run, or None for a method that has none."""
     if method in baselines.NAMES:
+        if changes:
+            raise UsageError(f"changes: got {', '.join(changes)}, expected none: method '{method}' has no settings")
         return None
     if method not in LEARNED:
         raise UsageError(f"method: got '{method}', expected one of {', '.join((*LEARNED, *baselines.NAMES))}")
@@ -209,13 +235,13 @@ def _load(run: str | Path | None, method: str, device: str) -> Predictor | None:
         raise UsageError(f"method: '{method}' needs a run, got none; train one first: dapdata train DATASET --method {method}")
     from daptrain.infer import Predictor
 
-    predictor = Predictor.load(run, device)
+    predictor = Predictor.load(run, device, changes=changes)
     if predictor.method != method:
         raise UsageError(f"{run}: was trained as '{predictor.method}', asked for '{method}'; give --method {predictor.method}")
     return predictor
 
 
-def _data_of(run: str | Path | None) -> str | Path:
+def data_of(run: str | Path | None) -> str | Path:
     """The dataset that a run was trained on."""
     if run is None:
         raise UsageError("data: got no dataset and no run; give one with --data")
@@ -229,6 +255,16 @@ def _data_of(run: str | Path | None) -> str | Path:
     if not Path(named).is_dir():
         raise UsageError(f"{run}: its dataset {named} is not there; say where it is with --data")
     return str(named)
+
+
+def _folder(run: str | Path | None, method: str, dataset: Dataset, changes: Mapping[str, Any]) -> Path:
+    """Where a report goes if nobody says: with changes not into the run, whose own report it is not."""
+    if not changes:
+        return Path(run or Path("runs") / f"{method}-{dataset.root.resolve().name}")
+    assert run is not None, "what has no run has nothing to change"
+    words = [word for name, value in changes.items() for word in (name, *(value if isinstance(value, list) else [value]))]
+    beside = Path(run).resolve()
+    return beside.with_name("-".join([beside.name, *map(str, words)]))
 
 
 # About the method ------------------------------------------------------------------------------------------
@@ -251,7 +287,7 @@ def _cost(found: Proposals, predictor: Predictor | None, run: str | Path | None,
         prepare_s=prepare,
         infer_s=infer,
         parameters=parameters,
-        demos_used=len(loading.open(dataset.root, "train")),
+        demos_used=predictor.config.demos or len(loading.open(dataset.root, "train")),
         training_minutes=_training_minutes(Path(run) / "metrics.jsonl"),
         device=str(predictor.device),
     )
@@ -282,18 +318,30 @@ def _write(
     report: Report,
     results: Sequence[metrics.SceneResult],
     samples: Sequence[Mapping[str, Array]],
-    pictures: bool,
+    film: bytes | None,
     say: Say,
 ) -> None:
-    """Writes report.json and report.html, each whole or not at all."""
+    """Writes report.json and report.html, each whole or not at all; without samples there are no pictures of scenes."""
     from daptrain.page import page
 
-    html = page(report, results, samples if pictures else [], say)
+    html = page(report, results, samples, film, say)
     text = json.dumps(report.model_dump(mode="json", by_alias=True), indent=1)
     for name, content in {"report.json": text, "report.html": html}.items():
         staged = folder / f".{name}.part"
         staged.write_text(content, encoding="utf-8")
         staged.replace(folder / name)
+
+
+def _film(predictor: Predictor | None, samples: Sequence[Sample], found: Proposals, seed: int, say: Say) -> bytes | None:
+    """The PNG of how one scene's samples come about: the first with several goals; None if there is nothing to show."""
+    if predictor is None or predictor.method != "dap":
+        return None
+    from daptrain.film import ROWS, film
+
+    readable = [s for s in samples if found.placements[int(s["meta/demo"])][0].status != UNREADABLE]
+    several = [s for s in readable if len(s["goals/T_world_object"]) >= ROWS]
+    say("pictures: from noise to one place")
+    return film(predictor, (several or readable)[0], seed) if readable else None
 
 
 def _seldom(say: Say) -> Say:

@@ -34,6 +34,7 @@ from torch import Tensor
 from dapdata import rng as random
 from dapdata.config import TrainConfig
 from dapdata.errors import UsageError
+from dapdata.loading import Dataset
 from daptrain import affordance, diffusion, pose
 from daptrain.affordance import AffordanceNet
 from daptrain.checkpoint import (
@@ -141,6 +142,7 @@ def train(
     names: list[NetName] = [name for name in PARTS if net in ("both", name)]
     if not names:
         raise UsageError(f"net: got '{net}', expected both, affordance or pose")
+    demos = demos_used(train_split, config)
     start_run(
         run, describe(str(dataset), task, whole.digest, whole.recipe, config, method, str(where)) | {"data": str(dataset)}
     )
@@ -151,7 +153,7 @@ def train(
     rule = LabelRule(whole.recipe["label"]["eps_place"], whole.recipe["label"]["kind"])
     every_goal = config.model_copy(update={"goals": "all"})  # validation asks whether a sample is any valid goal
     material = Material(
-        prepared(train_split, len(train_split), rule, config),
+        prepared(train_split, demos, rule, config),
         prepared(val_split, min(len(val_split), VALIDATION_SCENES), rule, every_goal),
         rule,
         int(whole.recipe["seed"]),
@@ -198,6 +200,22 @@ def check_budget(minutes: float | None, steps: int | None) -> None:
         raise UsageError(f"minutes: got {minutes}, expected a number above 0")
     if steps is not None and steps < 1:
         raise UsageError(f"steps: got {steps}, expected at least 1")
+
+
+def demos_used(train_split: Dataset, config: TrainConfig) -> int:
+    """How many demos of a train split are learned from: its first ones, so that fewer are a part of more.
+
+    The order is that of the demos' numbers. Each demo is drawn on its own, so the first ones are like all others, and
+    those of a short dataset are the first ones of a longer one with the same recipe.
+    """
+    held = len(train_split)
+    if held == 0:
+        raise UsageError(f"{train_split.root}: the train split holds no demo, expected at least 1; generate more demos")
+    if config.demos is not None and config.demos > held:
+        raise UsageError(
+            f"train.demos: got {config.demos}, the train split of {train_split.root} holds {held}; ask for at most that many"
+        )
+    return config.demos or held
 
 
 def cores() -> int:

@@ -6,7 +6,7 @@ import base64
 import io
 from collections.abc import Callable, Mapping, Sequence
 from html import escape
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,9 @@ from dapdata.errors import require
 from dapdata.metrics import SceneResult
 from dapdata.pictures import draw_goals, draw_scene, front_view
 from dapdata.report import Interval, Quantiles, Report, Summary
+
+if TYPE_CHECKING:
+    from daptrain.curve import Curve, Figures
 
 Array = NDArray[Any]
 
@@ -28,7 +31,7 @@ SUCCESS_ROWS = {
     "success_single": "one sample, on average",
     "success_precise": "best, ends within 5 mm and 3°",
     "success_near_goal": "best, within 2 cm of a verified goal",
-    "success_tight": "best, at a tight goal",
+    "success_tight": "best of those that head for a tight goal",
 }
 GEOMETRY_ROWS = {
     "penetration_mm": "overlap at the predicted pose, mm",
@@ -66,7 +69,11 @@ svg text { font-size: 12px; fill: var(--ink); }
 
 
 def page(
-    report: Report, results: Sequence[SceneResult], samples: Sequence[Mapping[str, Array]], say: Callable[[str], None]
+    report: Report,
+    results: Sequence[SceneResult],
+    samples: Sequence[Mapping[str, Array]],
+    film: bytes | None,
+    say: Callable[[str], None],
 ) -> str:
     """The whole page.
 
@@ -74,6 +81,7 @@ def page(
         report: What it shows.
         results: Of the method, one a scene.
         samples: The same scenes, for the pictures; none are made when it is empty.
+        film: The PNG of `film.film`, if there is one.
         say: Gets a line now and then.
     """
     methods = {report.method.name: Summary(success=report.success, modes=report.modes, geometry=report.geometry)}
@@ -104,10 +112,51 @@ def page(
         _geometry_table(methods),
         "<h2>Cost</h2>",
         _cost_table(report),
+        "" if film is None else _film(film),
         pictured,
         "<h2>What was judged</h2>",
         _digests(report),
     ]
+    return _document(title, parts)
+
+
+def curve_page(curve: Curve, picture: bytes) -> str:
+    """The page on a curve of sample efficiency.
+
+    Args:
+        curve: What it shows.
+        picture: The bytes of a PNG.
+    """
+    asked = curve.asked
+    budget = ", ".join(f"{asked.training[name]:g} {name}" for name in ("minutes", "steps") if asked.training[name] is not None)
+    title = f"{asked.training['method']} on {asked.task}: sample efficiency"
+    shown: list[tuple[str, Figures]] = [
+        (f'<a href="curve/{point.demos}/report.html">{point.demos:,}</a>', point) for point in curve.points
+    ]
+    shown += [(escape(name), figures) for name, figures in curve.references.items()]
+    rows = [
+        [
+            name,
+            *(_percent(getattr(figures.success, key)) for key in SUCCESS_ROWS),
+            *([_percent(list(figures.recall.values())[-1])]),
+        ]
+        for name, figures in shown
+    ]
+    parts = [
+        f"<h1>{escape(title)}</h1>",
+        f"<p>For each number of demonstrations networks of their own, trained with the same budget ({budget}) on the first so "
+        f"many of the train split, and judged on the same {asked.judging['trials']} scenes of the "
+        f"{escape(asked.judging['split'])} split: {asked.judging['k']} candidates each, {asked.judging['protocol']} protocol. "
+        "Small figures and bands are 95 % intervals; those of scenes, not of training again.</p>",
+        f'<img alt="success over demonstrations" style="max-width:100%" src="{_embedded(picture, "png")}">',
+        _table(["demonstrations", *SUCCESS_ROWS.values(), "goals found by all candidates"], rows),
+        f"<h2>What was asked</h2><p>Dataset {escape(asked.data)}, <code>{escape(asked.dataset)}</code></p>",
+    ]
+    return _document(title, parts)
+
+
+def _document(title: str, parts: Sequence[str]) -> str:
+    """A page of its own that loads nothing."""
     head = f'<meta charset="utf-8"><meta name="viewport" content="width=device-width"><title>{escape(title)}</title>'
     body = "\n".join(parts)
     return f'<!doctype html>\n<html lang="en"><head>{head}<style>{STYLE}</style></head>\n<body>\n{body}\n</body></html>\n'
@@ -170,7 +219,7 @@ def _modes_table(report: Report) -> str:
     names = [name.replace("_", " ") for name in next(iter(modes.sweep_mm.values()), {})]
     entropy = f"<p>Entropy over the modes: {modes.entropy.value:.2f}; a uniform sampler has {modes.uniform_entropy:.2f}.</p>"
     first = _table(["", "recall", "uniform sampler", "all goals found", "uniform sampler", "precision"], rows)
-    return f"<div>{first}{entropy}{_table(['all K candidates', *names], sweep)}</div>"
+    return f"<div>{first}{entropy}{_table(['all candidates', *names], sweep)}</div>"
 
 
 def _geometry_table(methods: Mapping[str, Summary]) -> str:
@@ -299,6 +348,11 @@ def _pictures(results: Sequence[SceneResult], samples: Sequence[Mapping[str, Arr
     return "\n".join(parts)
 
 
+def _film(picture: bytes) -> str:
+    alt = "scores of the superpoints from noise to one place, three samples of one scene"
+    return f'<h2>From noise to one place</h2><img alt="{alt}" style="max-width:100%" src="{_embedded(picture, "png")}">'
+
+
 def _legend() -> str:
     colors = {"verified goals": GOAL, "prediction": PREDICTED, "where it came to rest": ENDED}
     spans = "".join(
@@ -327,7 +381,7 @@ def _figure(result: SceneResult, sample: Mapping[str, Array]) -> str:
 def _views(result: SceneResult, sample: Mapping[str, Array]) -> tuple[Array, Array]:
     """The observed cloud with the prediction, and the true scene with goals, prediction and end."""
     camera = front_view(sample, *PICTURE)
-    predicted, goals = result.T_world_object[:1], sample["goals/T_world_object"]
+    predicted, goals = result.T_world_object[: min(1, len(result.verdicts))], sample["goals/T_world_object"]
     ended = [v.T_world_object_end for v in result.verdicts[:1] if np.isfinite(v.T_world_object_end).all()]
     seen, true = blank(camera), blank(camera)
     points = sample["container/points"].astype(float)
@@ -347,4 +401,9 @@ def _inline(pixels: Array) -> str:
 
     buffer = io.BytesIO()
     imsave(buffer, pixels, format="jpeg", pil_kwargs={"quality": 82})
-    return "data:image/jpeg;base64," + base64.b64encode(buffer.getvalue()).decode()
+    return _embedded(buffer.getvalue(), "jpeg")
+
+
+def _embedded(content: bytes, kind: str) -> str:
+    """The bytes of a PNG or JPEG file as a data URL."""
+    return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"

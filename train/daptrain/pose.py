@@ -23,7 +23,7 @@ from torch import Tensor, nn
 
 from dapdata import poses
 from dapdata.config import TrainConfig
-from daptrain.layers import UNIT, PointBlock, PointEncoder, neighbours
+from daptrain.layers import UNIT, PointBlock, PointEncoder, exact, halved, neighbours
 from daptrain.prepare import Array, Crop
 
 CROP_CHANNELS = 7  # position 3, normal 3, score 1
@@ -76,22 +76,25 @@ class PoseNet(nn.Module):
 
     def forward(self, batch: CropBatch) -> Matches:
         config = self.config
-        standing = batch.object_points @ self.reference.T
-        near_object = neighbours(standing, standing, batch.object_mask, config.neighbours)
-        near_crop = neighbours(batch.points, batch.points, batch.mask, config.neighbours)
-        to_crop = neighbours(standing, batch.points, batch.mask, config.cross_neighbours)
-        to_object = neighbours(batch.points, standing, batch.object_mask, config.cross_neighbours)
+        with exact(batch.points.device):
+            standing = batch.object_points @ self.reference.T
+            near_object = neighbours(standing, standing, batch.object_mask, config.neighbours)
+            near_crop = neighbours(batch.points, batch.points, batch.mask, config.neighbours)
+            to_crop = neighbours(standing, batch.points, batch.mask, config.cross_neighbours)
+            to_object = neighbours(batch.points, standing, batch.object_mask, config.cross_neighbours)
         crop = self.encode_crop(batch.features, near_crop)
         thing = self.encode_object(batch.object_features, near_object)
         for alone, inward, outward in zip(self.object_self, self.object_from_crop, self.crop_from_object):
             thing = alone(thing, thing, near_object)
             thing = inward(thing, crop, to_crop)
             crop = outward(crop, thing, to_object)
-        logits = self.project_object(thing) @ self.project_crop(crop).mT * config.pose_width**-0.5
-        targets = logits.masked_fill(~batch.mask[:, None], -torch.inf).softmax(dim=-1) @ batch.points
-        if self.offset is not None:
-            targets = targets + self.offset(torch.cat((thing, targets - standing), dim=-1))
-        return Matches(dual_softmax(logits, batch.object_mask, batch.mask), targets)
+        with exact(batch.points.device):
+            thing, crop = thing.float(), crop.float()
+            logits = self.project_object(thing) @ self.project_crop(crop).mT * config.pose_width**-0.5
+            targets = logits.masked_fill(~batch.mask[:, None], -torch.inf).softmax(dim=-1) @ batch.points
+            if self.offset is not None:
+                targets = targets + self.offset(torch.cat((thing, targets - standing), dim=-1))
+            return Matches(dual_softmax(logits, batch.object_mask, batch.mask), targets)
 
 
 def dual_softmax(logits: Tensor, row_mask: Tensor, column_mask: Tensor) -> Tensor:
@@ -155,7 +158,8 @@ def loss(net: PoseNet, batch: CropBatch, T_crop_box: Tensor, ramp: float) -> tup
         T_crop_box: (B, 4, 4) float32, m: the goal, the right one of its symmetric copies.
         ramp: Weight in [0, 1] of the residual term, which competes with the correspondences when it starts at once.
     """
-    matches = net(batch)
+    with halved(batch.points.device):
+        matches = net(batch)
     goal = batch.object_points @ T_crop_box[:, :3, :3].mT + T_crop_box[:, None, :3, 3] / UNIT
     positive = torch.cdist(goal, batch.points) <= net.config.eps_corr / UNIT
     positive &= batch.object_mask[:, :, None] & batch.mask[:, None]

@@ -25,7 +25,7 @@ from dapdata import poses
 from dapdata import rng as random
 from dapdata.config import TrainConfig
 from dapdata.records import SYMMETRIES
-from daptrain.fit import fit_container, fit_object
+from daptrain.fit import ObjectFit, fit_container, fit_object
 
 Array = NDArray[Any]
 
@@ -92,7 +92,7 @@ class LabelRule:
 
 def prepare(sample: dict[str, Array], rule: LabelRule, config: TrainConfig) -> Example:
     """One demo of a dataset (arrays by shard path) as an Example."""
-    inputs = prepare_inputs(
+    inputs, _ = prepare_inputs(
         sample["container/points"],
         sample["container/normals"],
         sample["container/superpoint"],
@@ -116,8 +116,8 @@ def prepare_inputs(
     object_normals: Array,
     config: TrainConfig,
     rng: np.random.Generator,
-) -> Inputs:
-    """The clouds in their canonical frames, thinned out to at most `config.container_points` raw points.
+) -> tuple[Inputs, ObjectFit]:
+    """The clouds in their canonical frames, the container's thinned out to `config.container_points`, and the object's fit.
 
     Args:
         container_points: (N, 3) world frame, z up, m.
@@ -138,7 +138,7 @@ def prepare_inputs(
     keep = _thin(len(container_points), config.container_points, rng)
     few = _thin(len(object_points), 4 * config.object_points, rng)
     centres = poses.transform(T_front_world, superpoints)
-    return Inputs(
+    inputs = Inputs(
         T_world_front=T_world_front,
         T_world_box=box.T_world_box,
         extents=_single(box.size),
@@ -152,6 +152,7 @@ def prepare_inputs(
         object_points=_single(poses.transform(T_box_world, object_points[few])),
         object_normals=_single(poses.rotate(T_box_world, object_normals[few])),
     )
+    return inputs, box
 
 
 def prepare_targets(sample: dict[str, Array], inputs: Inputs, rule: LabelRule, config: TrainConfig) -> Targets:
@@ -241,25 +242,27 @@ def clean_region(score: Array, superpoints: Array, reach: float) -> Array | None
     return np.asarray(positive & (np.linalg.norm(superpoints - peak, axis=1) <= reach))
 
 
+def one_region(inputs: Inputs, score: Array, eps_place: float) -> Array | None:
+    """`clean_region` of a score that was labelled with eps_place (m), with the reach of this object."""
+    return clean_region(score, inputs.superpoints, region_reach(inputs.extents, eps_place))
+
+
 def region_reach(extents: Array, eps_place: float) -> float:
     """How far (m) from the middle of its region an object of these extents can touch a superpoint's centre."""
     return float(np.linalg.norm(extents) / 2 + eps_place)
 
 
 def crop(
-    inputs: Inputs, score: Array, eps_place: float, margin: float, config: TrainConfig, rng: np.random.Generator
+    inputs: Inputs, score: Array, region: Array, margin: float, config: TrainConfig, rng: np.random.Generator
 ) -> Crop | None:
-    """Raw container points in the box around the region that a score names, or None when it names none.
+    """Raw container points in the box around a region, or None when none of them lies in the region.
 
     Args:
         inputs: The clouds.
-        score: (S,) in [-1, 1], sampled or a label.
-        eps_place: Distance that the score was labelled with, m.
+        score: (S,) in [-1, 1], sampled or a label; the crop is told of it within the region.
+        region: (S,) bool, as of `one_region`.
         margin: Added on each side of the region's bounding box, m.
     """
-    region = clean_region(score, inputs.superpoints, region_reach(inputs.extents, eps_place))
-    if region is None:
-        return None
     inside = region[inputs.container_superpoint]
     if not inside.any():
         return None
@@ -325,7 +328,10 @@ def pose_item(
     if not (score > 0).any():
         return None
     score = worn_region(score, inputs.neighbours, rng)
-    piece = crop(inputs, score, rule.eps_place, float(rng.uniform(0, 2 * config.crop_margin)), config, rng)
+    region = one_region(inputs, score, rule.eps_place)
+    if region is None:
+        return None
+    piece = crop(inputs, score, region, float(rng.uniform(0, 2 * config.crop_margin)), config, rng)
     if piece is None:
         return None
     turn = random_turn(config, rng)

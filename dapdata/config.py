@@ -85,7 +85,7 @@ PAPER: dict[str, Any] = {
 
 # Keys that inference reads: `dapdata eval --set train.KEY=VALUE` changes them without training again. Only `crop_margin`
 # acts in training as well, with anything from none of it to twice as much.
-AT_INFERENCE = ("sample_steps", "crop_margin", "cap_crop", "refine", "ranking")
+AT_INFERENCE = ("sample_steps", "crop_margin", "cap_crop", "refine", "hover", "ranking")
 
 # STEPS and CRITERIA of daptrain.refine, which must not be imported here; a test compares them.
 Step = Literal["gravity", "yaw", "settle", "search"]
@@ -153,6 +153,14 @@ class TrainConfig(Section):
     )
     refine: list[Step] = key(
         list(get_args(Step)), "what is done to candidates on the observed cloud, in this order however listed; []: nothing"
+    )
+    hover: float = key(
+        0.0,
+        "candidates are raised by this, after refinement: for who lets go of the object without lifting it over its support "
+        "on the way in, as the rpdiff protocol does",
+        unit="m",
+        ge=0,
+        le=0.05,
     )
     ranking: list[Literal[Criterion, "collision"]] = key(
         list(get_args(Criterion)),

@@ -18,7 +18,7 @@ def test_a_recipe_becomes_a_report(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     command = ["run", str(tiny_recipe), "--minutes", "0.4", "--trials", "1", "-k", "2"]
-    assert cli.run_app(command) == 0
+    assert cli.run_app(command) == 0, capsys.readouterr().err
     text = capsys.readouterr().out
     report = json.loads((tmp_path / "runs/tiny/report.json").read_text())
     assert report["judge"]["sound"]

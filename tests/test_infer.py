@@ -176,6 +176,19 @@ def test_just_the_steps_that_are_named_are_done(predictor, tilted, steps):
     assert (np.abs(found - T).max() < 1e-9) == (steps == [])
 
 
+@pytest.mark.parametrize("ranking", [list(refine.CRITERIA), ["collision"], []])
+def test_candidates_are_raised_by_the_hover_and_ranked_where_they_are_then(predictor, tilted, ranking):
+    proposals, container, box = tilted
+    found, _ = with_config(predictor, ranking=ranking).finish(proposals, *container, box)
+    raised, scores = with_config(predictor, ranking=ranking, hover=0.02).finish(proposals, *container, box)
+    up = np.eye(4)
+    up[2, 3] = 0.02
+    np.testing.assert_allclose(raised, up @ found, atol=1e-12)
+    if len(ranking) > 1:
+        residual = np.array([p.residual for p in proposals])
+        np.testing.assert_allclose(scores, refine.rank(raised, refine.observed_scene(*container), box, residual, ranking))
+
+
 @pytest.mark.parametrize("criteria", [["path"], ["path", "balance"], ["residual"], list(refine.CRITERIA)])
 def test_just_the_criteria_that_are_named_count(predictor, tilted, criteria):
     proposals, container, box = tilted
@@ -220,7 +233,7 @@ def test_what_is_fixed_in_training_cannot_be_changed_afterwards(tmp_path, change
 
 def test_a_change_holds_for_the_predictor_and_not_for_the_run(tmp_path):
     run = write_run(tmp_path / "run")
-    changes = {"sample_steps": 2, "crop_margin": 0.01, "cap_crop": "peak", "refine": [], "ranking": ["path"]}
+    changes = {"sample_steps": 2, "crop_margin": 0.01, "cap_crop": "peak", "refine": [], "hover": 0.01, "ranking": ["path"]}
     assert set(changes) == set(AT_INFERENCE)
     config = Predictor.load(run, "cpu", changes=changes).config
     assert {name: getattr(config, name) for name in changes} == changes

@@ -207,7 +207,7 @@ class Predictor:
     def finish(
         self, proposals: list[Proposal], container_points: Array, container_normals: Array, box: ObjectFit
     ) -> tuple[Array, Array]:
-        """(K, 4, 4) T_world_box and (K,) scores, larger is better, after refinement and ranking, as the config says.
+        """(K, 4, 4) T_world_box and (K,) scores, larger is better, after refinement, hover and ranking, as the config says.
 
         With an empty ranking all scores are equal: the order drawn is kept. Without a pose the score is -inf.
 
@@ -223,6 +223,7 @@ class Predictor:
         if steps or not counted:
             scene = refine.observed_scene(container_points, container_normals)
             T_world_box = refine.refine(T_world_box, scene, box, steps)
+        T_world_box[:, 2, 3] += self.config.hover
         if counted:
             return T_world_box, refine.rank_collision_count(T_world_box, container_points, box)
         residual = np.array([p.residual for p in proposals])

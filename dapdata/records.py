@@ -150,7 +150,7 @@ class Cloud:
         ("camera", 4, 4),
         "m",
         "world",
-        "believed pose, OpenCV axes: x right, y down, z ahead",
+        "pose the cloud was fused with: believed, then aligned to the other views; OpenCV axes: x right, y down, z ahead",
     )
 
 

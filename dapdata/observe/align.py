@@ -20,6 +20,7 @@ from dapdata.observe.cameras import View
 from dapdata.poses import inverse, pose, rotate, rotation_about, transform
 from dapdata.records import Array
 
+IMAGE_ROWS = 240  # partners are sought in images of about this height: of larger ones every 4th, 9th, ... point is taken
 SAMPLES = 500  # points of a view that look for partners in another
 ROUNDS = 6
 CONVERGED = 2e-5  # m or rad: a smaller step ends the iteration
@@ -39,10 +40,12 @@ def align(views: list[View], points: list[Array], normals: list[Array]) -> Array
         normals: (n, 3) unit.
     """
     T = np.stack([view.T_world_camera for view in views])
-    local = [transform(inverse(view.T_world_camera), p.astype(float)) for view, p in zip(views, points)]
-    facing = [rotate(inverse(view.T_world_camera), n.astype(float)) for view, n in zip(views, normals)]
+    strides = [max(1, round(view.height / IMAGE_ROWS)) for view in views]
+    local = [transform(inverse(T[v]), p[:: strides[v] ** 2].astype(float)) for v, p in enumerate(points)]
+    facing = [rotate(inverse(T[v]), n[:: strides[v] ** 2].astype(float)) for v, n in enumerate(normals)]
     seekers = [np.unique(np.linspace(0, len(p) - 1, min(len(p), SAMPLES)).astype(int)) for p in local]
-    rows = [_rows(view, p) for view, p in zip(views, local)]
+    K = [view.K / [[stride], [stride], [1]] for view, stride in zip(views, strides)]
+    rows = [_rows(p, K[v], -(-views[v].height // strides[v]), -(-views[v].width // strides[v])) for v, p in enumerate(local)]
     prior = np.tile([TRANSLATION**-2] * 3 + [ROTATION**-2] * 3, len(views))
     moved = np.zeros(6 * len(views))  # sum of the steps: they are small enough to add up
     for iteration in range(ROUNDS):
@@ -50,7 +53,7 @@ def align(views: list[View], points: list[Array], normals: list[Array]) -> Array
         gate = GATES[min(iteration // 2, 1)]
         for a, b in permutations(range(len(views)), 2):
             own = local[a][seekers[a]], facing[a][seekers[a]]
-            _add_pair(*own, local[b], facing[b], rows[b], views[b].K, inverse(T[b]) @ T[a], a, b, gate, H, g)
+            _add_pair(*own, local[b], facing[b], rows[b], K[b], inverse(T[b]) @ T[a], a, b, gate, H, g)
         step = np.linalg.solve(H, g)
         moved += step
         for v in range(len(views)):
@@ -62,13 +65,13 @@ def align(views: list[View], points: list[Array], normals: list[Array]) -> Array
     return T
 
 
-def _rows(view: View, local: Array) -> Array:
-    """(H, W) i4: which point (n, 3), camera frame, a pixel sees; -1 for none."""
-    rows = np.full((view.height, view.width), -1, np.int32)
-    if len(local):
-        u, v = (np.floor(view.K[k, k] * local[:, k] / local[:, 2] + view.K[k, 2]).astype(int) for k in (0, 1))
-        u, v = np.clip(u, 0, view.width - 1), np.clip(v, 0, view.height - 1)  # an outermost pixel may round outwards
-        rows[v, u] = np.arange(len(local))
+def _rows(points: Array, K: Array, height: int, width: int) -> Array:
+    """(H, W) i4: one of the points (n, 3), camera frame, that each pixel of a camera (3, 3) sees; -1 for none."""
+    rows = np.full((height, width), -1, np.int32)
+    if len(points):
+        u, v = (np.floor(K[k, k] * points[:, k] / points[:, 2] + K[k, 2]).astype(int) for k in (0, 1))
+        u, v = np.clip(u, 0, width - 1), np.clip(v, 0, height - 1)  # an outermost pixel may round outwards
+        rows[v, u] = np.arange(len(points))
     return rows
 
 

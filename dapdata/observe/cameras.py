@@ -1,6 +1,6 @@
 """Where the cameras stand, and how wrong we are about it.
 
-A view has two poses: `T_world_camera` is the believed one, from which the points are computed and which is stored;
+A view has two poses: `T_world_camera` is the believed one, which `align.py` corrects where views overlap before it is stored;
 `T_world_camera_true` is where the rays start. Camera axes are OpenCV's: x right, y down, z ahead.
 """
 

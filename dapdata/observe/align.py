@@ -43,7 +43,8 @@ def align(views: list[View], points: list[Array], normals: list[Array]) -> Array
     strides = [max(1, round(view.height / IMAGE_ROWS)) for view in views]
     local = [transform(inverse(T[v]), p[:: strides[v] ** 2].astype(float)) for v, p in enumerate(points)]
     facing = [rotate(inverse(T[v]), n[:: strides[v] ** 2].astype(float)) for v, n in enumerate(normals)]
-    seekers = [np.unique(np.linspace(0, len(p) - 1, min(len(p), SAMPLES)).astype(int)) for p in local]
+    few = [np.unique(np.linspace(0, len(p) - 1, min(len(p), SAMPLES)).astype(int)) for p in local]
+    seekers = [(p[chosen], n[chosen]) for p, n, chosen in zip(local, facing, few)]
     K = [view.K / [[stride], [stride], [1]] for view, stride in zip(views, strides)]
     rows = [_rows(p, K[v], -(-views[v].height // strides[v]), -(-views[v].width // strides[v])) for v, p in enumerate(local)]
     prior = np.tile([TRANSLATION**-2] * 3 + [ROTATION**-2] * 3, len(views))
@@ -52,8 +53,7 @@ def align(views: list[View], points: list[Array], normals: list[Array]) -> Array
         H, g = np.diag(prior), -prior * moved
         gate = GATES[min(iteration // 2, 1)]
         for a, b in permutations(range(len(views)), 2):
-            own = local[a][seekers[a]], facing[a][seekers[a]]
-            _add_pair(*own, local[b], facing[b], rows[b], K[b], inverse(T[b]) @ T[a], a, b, gate, H, g)
+            _add_pair(*seekers[a], local[b], facing[b], rows[b], K[b], inverse(T[b]) @ T[a], a, b, gate, H, g)
         step = np.linalg.solve(H, g)
         moved += step
         for v in range(len(views)):

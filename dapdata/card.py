@@ -40,55 +40,68 @@ or, with dapdata installed, `dapdata.open(".", split="train")[0]`, and `.torch()
 """
 
 
-def render(manifest: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], previews: Sequence[str]) -> str:
+MEANS = ("goals", "container_points", "object_points", "superpoints", "positives", "correspondences")  # of the index
+
+
+def render(
+    manifest: Mapping[str, Any],
+    stages: Mapping[str, Mapping[str, Any]],
+    shards: int,
+    demos: int,
+    means: Mapping[str, float],
+    previews: Sequence[str],
+) -> str:
     """The card as Markdown.
 
     Args:
-        manifest: As JSON data.
-        rows: Of the index; empty before the dataset is labelled.
+        manifest: As JSON data, but for shards and stages.
+        stages: The spec of each stage whose units are there.
+        shards: How many there are.
+        demos: How many are in them; 0 before the dataset is labelled.
+        means: Of the columns `MEANS` of the index.
         previews: Paths of pictures.
     """
-    size = next((text for limit, text in SIZES if len(rows) < limit), "n>1M")
+    size = next((text for limit, text in SIZES if demos < limit), "n>1M")
     parts = [
         HEADER.format(license=LICENSE, name=manifest["name"], size=size) + f"# {manifest['name']}\n",
-        _what(manifest, rows),
+        _what(manifest, shards, demos, means),
         "\n".join(f"![{path}]({path})" for path in previews),
         _splits(manifest),
         _rejects(manifest["rejects"]),
-        f"## Read it\n\n{LOADER}" if rows else "No shards yet: run `dapdata label` on this folder.\n",
+        f"## Read it\n\n{LOADER}" if demos else "No shards yet: run `dapdata label` on this folder.\n",
         _arrays(),
-        _how(manifest),
+        _how(manifest, stages),
     ]
     return "\n".join(part for part in parts if part)
 
 
-def _what(manifest: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> str:
+def _what(manifest: Mapping[str, Any], shards: int, demos: int, means: Mapping[str, float]) -> str:
     asked = f"Demonstrations of placing an object into a container, task `{manifest['task']}`, made in simulation by dapdata"
-    if not rows:
+    if not demos:
         return f"{asked}: {manifest['demos']} demos, not yet labelled.\n"
-    names = ("goals", "container_points", "object_points", "superpoints", "positives", "correspondences")
-    lines = [f"| {name.replace('_', ' ')} | {_mean(rows, name):.1f} |" for name in names]
-    count = f"{len(rows)} demos of {manifest['demos']} asked for, in {len(manifest['shards'])} shards"
+    lines = [f"| {name.replace('_', ' ')} | {means[name]:.1f} |" for name in MEANS]
+    count = f"{demos} demos of {manifest['demos']} asked for, in {shards} shards"
     return "\n".join([f"{asked}: {count}.\n", "| a demo has on average | |", "|---|---|", *lines, ""])
-
-
-def _mean(rows: Sequence[Mapping[str, Any]], name: str) -> float:
-    return float(sum(row[name] for row in rows)) / len(rows)
 
 
 def _splits(manifest: Mapping[str, Any]) -> str:
     if not manifest["splits"]:
         return ""
     lines = [
-        f"| {name} | {entry['demos']} | {len(entry['container_instances'])} | {len(entry['object_instances'])} |"
+        f"| {name} | {entry['demos']} | {_count(entry['container_instances'])} | {_count(entry['object_instances'])} |"
         for name, entry in manifest["splits"].items()
     ]
     proof = (
         "No container instance (digest of the geometry of container and clutter) and no object instance is in two splits; "
-        "the instances of each stand in `manifest.json`, and `dapdata verify` fails on any overlap."
+        "the instances of each demo stand in `index.parquet`, and `dapdata verify` fails on any overlap."
     )
     table = ["| split | demos | container instances | object instances |", "|---|---|---|---|"]
     return "\n".join(["## Splits\n", *table, *lines, "", proof, ""])
+
+
+def _count(instances: Sequence[int] | int) -> int:
+    """How many instances; large manifests tell no more."""
+    return instances if isinstance(instances, int) else len(instances)
 
 
 def _rejects(rejects: Mapping[str, Mapping[str, int]]) -> str:
@@ -121,13 +134,11 @@ def _arrays() -> str:
     return "\n".join([*lines, ""])
 
 
-def _how(manifest: Mapping[str, Any]) -> str:
+def _how(manifest: Mapping[str, Any], stages: Mapping[str, Mapping[str, Any]]) -> str:
     recipe = manifest["recipe"]
     lines = ["## How it was made\n"]
-    for name, entry in manifest["stages"].items():
-        if not entry["units"]:
-            continue
-        spec, sections = entry["spec"], ", ".join(sorted(entry["spec"]["sections"]))
+    for name, spec in stages.items():
+        sections = ", ".join(sorted(spec["sections"]))
         versions = ", ".join(f"{package} {number}" for package, number in sorted(spec["packages"].items()))
         lines.append(f"- `{name}` version {spec['version']} ({versions}), recipe sections {sections}")
     lines += [

@@ -30,7 +30,7 @@ LINES = (
     ("loading", "draw", "schemas"),
     ("metrics", "health", "pictures"),
     ("viewer",),
-    ("show", "bench"),
+    ("show", "bench", "doctor"),
     ("cli",),
     ("__main__",),
 )

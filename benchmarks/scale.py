@@ -269,7 +269,6 @@ class Cost:
     workers: int
     wall: float  # s
     cpu: float  # s, of all processes
-    start: float  # s until a worker has imported and compiled what it needs
     shard_bytes: float
     cache_bytes: float  # of the upstream stages, but for what the shards are linked to
     files: int  # in a shard
@@ -283,13 +282,18 @@ def make(demos: int, shard_size: int, workers: int) -> Cost:
         pipeline.generate(recipe.load(RECIPE, [f"demos={demos}", f"shard_size={shard_size}"]), root, workers=workers)
         pipeline.label(root, workers=workers)
         wall, cpu = time.perf_counter() - wall, _cpu() - before
-        log = list(manifest.read_log(root))
         shards = manifest.read(root).shards
         both = [path.stat() for path in (root / "stages").rglob("*") if path.is_file()]
-        busy = sum(line["seconds"] for line in log) / workers
         files = sum(path.is_file() for path in (root / shards[0].path).rglob("*"))
         alone = sum(fact.st_size for fact in both if fact.st_nlink == 1)
-        return Cost(demos, workers, wall, cpu, max(wall - busy, 0.0), sum(s.bytes for s in shards), alone, files)
+        return Cost(demos, workers, wall, cpu, sum(s.bytes for s in shards), alone, files)
+
+
+def start_up() -> float:
+    """CPU seconds of a process that imports what a worker needs, makes one demo with it, and ends."""
+    before = _cpu()
+    subprocess.run([sys.executable, __file__, "--one"], check=True, stdout=subprocess.DEVNULL)
+    return _cpu() - before
 
 
 def _cpu() -> float:
@@ -315,7 +319,9 @@ def cost_table(found: Sequence[Cost]) -> Iterator[str]:
 # The cluster -----------------------------------------------------------------------------------------------
 
 
-def simulate(count: int, seconds: float, workers: int, start: float, lost_at: float = float("inf"), lost: int = 0) -> float:
+def simulate(
+    count: int, seconds: float, workers: int, start: float, lost_at: float = float("inf"), lost: int = 0, replaced: bool = True
+) -> float:
     """Seconds until the last of some units is made by workers that take them from one queue.
 
     Args:
@@ -324,7 +330,8 @@ def simulate(count: int, seconds: float, workers: int, start: float, lost_at: fl
         workers: How many there are.
         start: Seconds from a worker's start to its first unit.
         lost_at: When some of them die, with the unit that each is at: it goes back to the queue.
-        lost: How many; each is replaced at once by one that has to start first.
+        lost: How many.
+        replaced: Whether others take their place at once; they have to start first.
     """
     free = [(start, number) for number in range(workers)]  # when each worker is free, and who it is
     waiting, end, dying = count, 0.0, set(range(lost))
@@ -332,7 +339,8 @@ def simulate(count: int, seconds: float, workers: int, start: float, lost_at: fl
         now, number = heapq.heappop(free)
         if number in dying and now + seconds > lost_at:
             dying.discard(number)
-            heapq.heappush(free, (max(lost_at, now) + start, number))
+            if replaced:
+                heapq.heappush(free, (max(lost_at, now) + start, number))
             continue
         waiting -= 1
         end = max(end, now + seconds)
@@ -340,21 +348,24 @@ def simulate(count: int, seconds: float, workers: int, start: float, lost_at: fl
     return end
 
 
-def cluster_table(demos: int, shard_size: int, cost: Cost, plan_seconds: float) -> Iterator[str]:
+def cluster_table(demos: int, shard_size: int, cost: Cost, start: float, plan_seconds: float) -> Iterator[str]:
     """Files, bytes, tasks and hours of a dataset of that size, and what losing a tenth of the workers costs."""
     count, seconds = -(-demos // shard_size), cost.cpu / cost.demos * shard_size
     kept, cached = (part / cost.demos * demos / 1e12 for part in (cost.shard_bytes, cost.cache_bytes))
     hours = cost.cpu / cost.demos * demos / 3600
     yield f"{demos} demos in {count} shards of {shard_size}: {count * cost.files / 1e6:.1f} million files,"
-    yield f"{kept:.2f} TB of shards, {cached:.2f} TB more while the stages are kept; {hours:.0f} CPU hours; a unit takes"
-    yield f"{seconds:.0f} s; {count} Ray tasks for `generate` and as many for `label`, one a unit."
-    header = "| workers | hours | units a worker | hours with a tenth lost half-way | restart of the command, s |"
-    yield from ("", header, "|---|---|---|---|---|")
+    yield f"{kept:.2f} TB of shards, {cached:.3f} TB more while the stages are kept; {hours:.0f} CPU hours; a unit takes"
+    yield f"{seconds:.0f} s, a worker starts in {start:.1f} s, a stopped command plans again in {plan_seconds:.1f} s;"
+    yield f"{count} Ray tasks for `generate` and as many for `label`, one a unit."
+    yield from (
+        "",
+        "| workers | units a worker | minutes | a tenth of the workers is lost half-way, and replaced | not replaced |",
+    )
+    yield "|---|---|---|---|---|"
     for workers in WORKERS:
-        whole = simulate(count, seconds, workers, cost.start)
-        hurt = simulate(count, seconds, workers, cost.start, whole / 2, int(LOST * workers))
-        again = plan_seconds + cost.start
-        yield f"| {workers} | {whole / 3600:.2f} | {count / workers:.0f} | {hurt / 3600:.2f} | {again:.0f} |"
+        whole, lost = simulate(count, seconds, workers, start), int(LOST * workers)
+        hurt = [simulate(count, seconds, workers, start, whole / 2, lost, replaced) for replaced in (True, False)]
+        yield f"| {workers} | {count / workers:.0f} | {whole / 60:.1f} | {hurt[0] / 60:.1f} | {hurt[1] / 60:.1f} |"
 
 
 # ------------------------------------------------------------------------------------------------------------
@@ -370,7 +381,7 @@ def machine() -> Mapping[str, Any]:
 def report(demos: int, shard_sizes: Sequence[int], few: int, published: Sequence[int]) -> Iterator[str]:
     """The tables of docs/scale.md."""
     yield ", ".join(f"{name} {value}" for name, value in machine().items())
-    costs = [make(few, 50, workers) for workers in (1, 2)]
+    costs, start = [make(few, 50, workers) for workers in (1, 2)], start_up()
     yield from ("", "## cost", "", *cost_table(costs))
     for shard_size in shard_sizes:
         with tempfile.TemporaryDirectory() as folder:
@@ -378,7 +389,7 @@ def report(demos: int, shard_sizes: Sequence[int], few: int, published: Sequence
             write_synthetic(root, demos, shard_size)
             yield from ("", "## opening", "", *opening_table(root, demos, shard_size))
             seconds = measured("plan", root)["wall"]
-        yield from ("", "## cluster", "", *cluster_table(demos, shard_size, costs[0], seconds))
+        yield from ("", "## cluster", "", *cluster_table(demos, shard_size, costs[0], start, seconds))
         yield from ("", "## publishing", *publishing_table(published, shard_size, demos))
 
 
@@ -389,9 +400,14 @@ def main() -> None:
     parser.add_argument("--small", action="store_true", help="few true demos and few published units")
     parser.add_argument("--measure", nargs=2, metavar=("WHAT", "ROOT"), help=argparse.SUPPRESS)
     parser.add_argument("--publish", type=int, help=argparse.SUPPRESS)
+    parser.add_argument("--one", action="store_true", help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.measure:
         print(json.dumps(measure(options.measure[0], Path(options.measure[1]))))
+    elif options.one:
+        with tempfile.TemporaryDirectory() as folder:
+            root = pipeline.generate(recipe.load(RECIPE, ["demos=1"]), Path(folder) / "one", engine="inline")
+            pipeline.label(str(root), engine="inline")
     elif options.publish:
         print(json.dumps(publish(options.publish, options.shard_size[0])))
     else:

@@ -335,12 +335,12 @@ def inspect(root: str | Path) -> Facts:
         "task": found.task,
         "content_sha256": found.content_sha256,
         "demos": found.demos,
-        "demos_in_shards": sum(shard.demos for shard in found.shards),
+        "demos_in_shards": sum(entry.demos for entry in found.splits.values()),
         "shards": len(found.shards),
         "splits": {name: entry.demos for name, entry in found.splits.items()},
         "rejects": found.rejects.model_dump(),
-        "bytes": {"shards": sum(s.bytes for s in found.shards)}
-        | {name: sum(unit.bytes for unit in stage.units) for name, stage in found.stages.items()},
+        "bytes": {"shards": manifest.total_bytes(found.shards)}
+        | {name: manifest.total_bytes(stage.units) for name, stage in found.stages.items()},
         "created_by": found.created_by,
     }
     return Facts(about | ({"per_demo": _statistics(root)} if found.shards else {}))

@@ -56,9 +56,9 @@ def assign(demos: Array, containers: Array, objects: Array, config: SplitConfig,
     for row, (demo, c, o) in enumerate(_rows(demos, container, thing)):
         while wished < demo:
             wish, wished = next(wishes), wished + 1
-        owners = {owner for owner in (owner_of_container[c], owner_of_object[o]) if owner is not None}
-        if len(owners) < 2:
-            splits[row] = owner_of_container[c] = owner_of_object[o] = owners.pop() if owners else wish
+        one, other = owner_of_container[c], owner_of_object[o]
+        if not one or not other or one == other:
+            splits[row] = owner_of_container[c] = owner_of_object[o] = one or other or wish
     return splits
 
 
@@ -68,10 +68,10 @@ def distinct(instances: Array) -> Array:
     return ordered[np.concatenate([[True], np.diff(ordered) > 0])] if len(ordered) else ordered
 
 
-def _numbered(instances: Array) -> tuple[list[str | None], Array]:
-    """The owner of each instance, nobody yet; and (D,) which instance is each demo's."""
+def _numbered(instances: Array) -> tuple[list[str], Array]:
+    """The owner of each instance, nobody ("") yet; and (D,) which instance is each demo's."""
     known, number = np.unique(instances, return_inverse=True)
-    return [None] * len(known), number
+    return [""] * len(known), number.astype(np.int32)
 
 
 def _rows(*columns: Array) -> Iterator[tuple[int, ...]]:

@@ -176,8 +176,8 @@ class Index(Mapping[str, Array]):
         return {**self.__dict__, "_held": {}}
 
 
-def read(path: Path, name: str, value: str) -> dict[str, list[Any]]:
-    """The columns of the rows in which a column of words has one value.
+def read(path: Path, name: str, value: str, columns: Sequence[str] | None = None) -> dict[str, list[Any]]:
+    """The columns, all by default, of the rows in which a column of words has one value.
 
     Raises:
         CorruptionError: if the file is missing or no Parquet file.
@@ -185,8 +185,9 @@ def read(path: Path, name: str, value: str) -> dict[str, list[Any]]:
     import pyarrow.parquet as pq
 
     with _explained(path):
-        columns: dict[str, list[Any]] = pq.read_table(path, filters=[(name, "=", value)]).to_pydict()
-        return columns
+        wanted = None if columns is None else list(columns)
+        found: dict[str, list[Any]] = pq.read_table(path, columns=wanted, filters=[(name, "=", value)]).to_pydict()
+        return found
 
 
 @contextmanager

@@ -237,6 +237,7 @@ def test_a_lost_worker_costs_its_unit_and_a_start(scale: ModuleType) -> None:
     assert alone == 17.0 + 2.0 + 3 * 10.0  # one unit was done, the second is lost 5 s after it was begun
     assert scale.simulate(count=4, seconds=10.0, workers=1, start=2.0, lost_at=99.0, lost=1) == 42.0
     assert scale.simulate(count=100, seconds=10.0, workers=10, start=0.0, lost_at=55.0, lost=1) == 105.0
+    assert scale.simulate(count=8, seconds=10.0, workers=2, start=0.0, lost_at=15.0, lost=1, replaced=False) == 70.0
 
 
 def test_a_synthetic_dataset_opens_and_plans_like_a_true_one(scale: ModuleType, tmp_path: Path) -> None:

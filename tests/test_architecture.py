@@ -42,7 +42,7 @@ MUST_NOT_KNOW = {
 }
 DAPTRAIN_MAY_KNOW = {
     "loading", "metrics", "records", "poses", "simulate", "errors", "rng", "config", "solids", "report", "predictions",
-    "pictures", "draw", "matching", "clouds",
+    "pictures", "draw", "matching", "clouds", "console",
     "cluster",  # a user's own cloud must be partitioned as the training clouds were
 }  # fmt: skip
 DOORS = {

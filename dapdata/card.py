@@ -1,141 +1,253 @@
-"""The dataset's card: a README.md that a stranger reads first, with the header that Hugging Face reads."""
+"""The dataset's card: a README.md that a stranger reads first, with the header that Hugging Face reads.
+
+It holds nothing that does not follow from the manifest and the index, so the same dataset has the same card. Exports
+carry the same card with what is particular to their files, a `Form`.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import json
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
-from dapdata.records import columns
+from dapdata.records import columns, is_ragged
+from dapdata.split import SPLITS
 
-HEADER = """---
-license: {license}
-task_categories:
-- robotics
-tags:
-- point-cloud
-- object-placement
-- superpoints
-- affordance
-pretty_name: {name}
-size_categories:
-- {size}
-configs:
-- config_name: index
-  data_files: index.parquet
----
-"""
 LICENSE = "cc0-1.0"  # synthetic geometry, nobody's work: the data may be used for anything
+LICENSE_URL = "https://creativecommons.org/publicdomain/zero/1.0/"
+TAGS = ("dapdata", "synthetic", "point-cloud", "object-placement", "superpoints", "affordance")
 SIZES = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"), (1_000_000, "100K<n<1M"))
+COUNTS = ("goals", "container_points", "object_points", "superpoints", "positives", "correspondences")
 
-LOADER = """```python
+
+@dataclass(frozen=True)
+class Form:
+    """What a card says of the files beside it; the rest is the same for shards and for exports."""
+
+    files: str  # Markdown: what is where
+    loader: str  # Markdown: how to read it
+    configs: str = ""  # YAML, the value of `configs` in the header: which files the viewer shows
+    has_arrays: bool = True  # whether the files hold the shards' arrays
+
+
+SHARDS = Form(
+    files=(
+        "Each shard, named by `manifest.json`, is a Zarr v3 group. Ragged arrays hold the rows of all demos one after another; "
+        "demo `d` is rows `offsets[d]` to `offsets[d + 1]` of its group. `index.parquet` has one row per demo."
+    ),
+    loader="""With zarr and numpy alone:
+
+```python
 import json, zarr
-root = "."  # this folder
-path = json.load(open(f"{root}/manifest.json"))["shards"][0]["path"]
-g = zarr.open_group(f"{root}/{path}", mode="r")
+path = json.load(open("manifest.json"))["shards"][0]["path"]
+g = zarr.open_group(path, mode="r")
 o, i = g["container_superpoints/offsets"][:], 0
 xyz, score = (g[f"container_superpoints/{k}"][o[i]:o[i+1]] for k in ("points", "affordance"))
 ```
 
 or, with dapdata installed, `dapdata.open(".", split="train")[0]`, and `.torch()` or `.stream()` of it for training.
+""",
+    configs="- config_name: index\n  data_files: index.parquet",
+)
+
+FRAMES = """## Units and frames
+
+- Metres, radians, kilograms, seconds. Poses are 4x4 matrices, float64; clouds are float32.
+- `T_a_b` maps b-coordinates to a: `p_a = T_a_b @ p_b`.
+- World: right-handed, z up, z = 0 on the table top. Clouds are in the world frame, as observed.
+- Container: z up, origin at the centre of its footprint, on the underside. Object: origin at the centre of its bounding
+  box, z up at a goal. Cameras: OpenCV axes (x right, y down, z ahead).
 """
 
+LIMITS = """## Limits
 
-def render(manifest: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], previews: Sequence[str]) -> str:
+- Everything is synthetic: scenes are drawn from the ranges of a recipe and consist of ideal solids without texture, and
+  depth noise is modelled, not recorded. How far a method trained on it carries over to real scans is not shown by the
+  data itself.
+- Containers and what stands in them do not move; there is one object, and no gripper or arm.
+- The labels belong to the demonstrated goal, which is one of several; the others are in `goals/`.
+"""
+
+DAP = """@article{chang2024dap,
+  title   = {{DAP}: Diffusion-based Affordance Prediction for Multi-modality Storage},
+  author  = {Chang, Haonan and Boyalakuntla, Kowndinya and Liu, Yuhan and Zhang, Xinyu and Schramm, Liam and
+             Boularias, Abdeslam},
+  journal = {arXiv preprint arXiv:2409.00499},
+  year    = {2024}
+}"""
+
+
+def render(manifest: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], previews: Sequence[str], form: Form = SHARDS) -> str:
     """The card as Markdown.
 
     Args:
         manifest: As JSON data.
-        rows: Of the index; empty before the dataset is labelled.
+        rows: Of the index, of the demos that are there; empty before the dataset is labelled.
         previews: Paths of pictures.
+        form: What is particular to the files.
     """
-    size = next((text for limit, text in SIZES if len(rows) < limit), "n>1M")
     parts = [
-        HEADER.format(license=LICENSE, name=manifest["name"], size=size) + f"# {manifest['name']}\n",
-        _what(manifest, rows),
-        "\n".join(f"![{path}]({path})" for path in previews),
-        _splits(manifest),
+        _header(manifest, rows, form),
+        f"# {manifest['name']}\n\n{summary(manifest, rows)}\n",
+        "".join(f"![{_alt(path)}]({path})\n" for path in previews),
+        *([f"## Read it\n\n{form.loader}", _averages(rows), _splits(rows)] if rows else [UNLABELLED]),
         _rejects(manifest["rejects"]),
-        f"## Read it\n\n{LOADER}" if rows else "No shards yet: run `dapdata label` on this folder.\n",
-        _arrays(),
+        FRAMES,
+        f"## Files\n\n{form.files}\n",
+        *([f"## Arrays\n\n{_table(ARRAYS_HEAD, _arrays())}"] if form.has_arrays else []),
         _how(manifest),
+        LIMITS,
+        f"## Licence\n\n[{LICENSE}]({LICENSE_URL}): use it for anything.\n",
+        f"## Citation\n\n```bibtex\n{citation(manifest)}\n```\n\nThe labels are those of\n\n```bibtex\n{DAP}\n```\n",
     ]
     return "\n".join(part for part in parts if part)
 
 
-def _what(manifest: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> str:
-    asked = f"Demonstrations of placing an object into a container, task `{manifest['task']}`, made in simulation by dapdata"
-    if not rows:
-        return f"{asked}: {manifest['demos']} demos, not yet labelled.\n"
-    names = ("goals", "container_points", "object_points", "superpoints", "positives", "correspondences")
-    lines = [f"| {name.replace('_', ' ')} | {_mean(rows, name):.1f} |" for name in names]
-    count = f"{len(rows)} demos of {manifest['demos']} asked for, in {len(manifest['shards'])} shards"
-    return "\n".join([f"{asked}: {count}.\n", "| a demo has on average | |", "|---|---|", *lines, ""])
+UNLABELLED = "No shards yet: run `dapdata label` on this folder.\n"
 
 
-def _mean(rows: Sequence[Mapping[str, Any]], name: str) -> float:
-    return float(sum(row[name] for row in rows)) / len(rows)
-
-
-def _splits(manifest: Mapping[str, Any]) -> str:
-    if not manifest["splits"]:
-        return ""
-    lines = [
-        f"| {name} | {entry['demos']} | {len(entry['container_instances'])} | {len(entry['object_instances'])} |"
-        for name, entry in manifest["splits"].items()
-    ]
-    proof = (
-        "No container instance (digest of the geometry of container and clutter) and no object instance is in two splits; "
-        "the instances of each stand in `manifest.json`, and `dapdata verify` fails on any overlap."
+def summary(manifest: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> str:
+    """What the dataset is, in a sentence or two."""
+    what = (
+        f"Demonstrations of placing an object into a container, task `{manifest['task']}`, made in simulation by dapdata "
+        f"{manifest['created_by']['dapdata']}"
     )
-    table = ["| split | demos | container instances | object instances |", "|---|---|---|---|"]
-    return "\n".join(["## Splits\n", *table, *lines, "", proof, ""])
+    if not rows:
+        return f"{what}: {manifest['demos']} demos, not yet labelled."
+    held = sum(shard["demos"] for shard in manifest["shards"])
+    part = f" of {held}" if len(rows) < held else ""
+    return (
+        f"{what}: {len(rows)}{part} demos, each with noisy point clouds of container and object, superpoints, every goal "
+        "that holds in physics, and the affordance and correspondence labels of the demonstrated one."
+    )
+
+
+def citation(manifest: Mapping[str, Any]) -> str:
+    """A BibTeX entry for the dataset; who publishes it adds author and year."""
+    digest = manifest["content_sha256"]
+    return "\n".join(
+        [
+            f"@misc{{{manifest['name']}_{digest[:8]},",
+            f"  title = {{{manifest['name']}: demonstrations of the task {manifest['task']}}},",
+            f"  note  = {{Made with dapdata {manifest['created_by']['dapdata']}; content sha256 {digest}}}",
+            "}",
+        ]
+    )
+
+
+def _header(manifest: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], form: Form) -> str:
+    size = next((text for limit, text in SIZES if len(rows) < limit), "n>1M")
+    lines = [f"license: {LICENSE}", "task_categories:", "- robotics", "tags:", *(f"- {tag}" for tag in TAGS)]
+    lines += [f"pretty_name: {manifest['name']}", "size_categories:", f"- {size}"]
+    lines += ["configs:", form.configs] if rows and form.configs else []
+    return "\n".join(["---", *lines, "---"])
+
+
+def _alt(path: str) -> str:
+    """What a picture shows, for those who cannot see it."""
+    known = {
+        "preview/clouds.png": "A demo's container as observed, and its superpoints",
+        "preview/goals.png": "The same demo's affordance (red: place here), and all goals that hold (orange: demonstrated)",
+    }
+    return known.get(path, path)
+
+
+def _table(head: Sequence[str], lines: Iterable[Sequence[object]]) -> str:
+    """A Markdown table."""
+    rows = [head, ["---"] * len(head), *lines]
+    return "".join(f"| {' | '.join(map(str, row))} |\n" for row in rows)
+
+
+def _averages(rows: Sequence[Mapping[str, Any]]) -> str:
+    means = [(name.replace("_", " "), f"{sum(row[name] for row in rows) / len(rows):.1f}") for name in COUNTS]
+    return "## What a demo holds\n\n" + _table(["on average", ""], means)
+
+
+def _splits(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Demos and instances of each split, and how many instances it shares with another: none, or it would be no split."""
+    kinds = ("container_instance", "object_instance")
+    names = [name for name in (*SPLITS, "unused") if any(row["split"] == name for row in rows)]
+    found = {name: [{row[kind] for row in rows if row["split"] == name} for kind in kinds] for name in names}
+
+    def shared(name: str, kind: int) -> int:
+        others = [found[other][kind] for other in names if other != name and "unused" not in (name, other)]
+        return len(found[name][kind] & set().union(*others))
+
+    lines = [
+        (name, sum(row["split"] == name for row in rows), *map(len, found[name]), shared(name, 0), shared(name, 1))
+        for name in names
+    ]
+    head = ["split", "demos", "containers", "objects", "containers shared with another split", "objects shared"]
+    proof = (
+        "An instance is a digest of the geometry: of the container with what stands in it, and of the object. "
+        "`manifest.json` of the dataset lists those of each split, and `dapdata verify` fails if two splits share one."
+    )
+    spare = " `unused` demos share one with two splits, and so belong to neither." if "unused" in names else ""
+    return f"## Splits\n\n{_table(head, lines)}\n{proof}{spare}\n"
 
 
 def _rejects(rejects: Mapping[str, Mapping[str, int]]) -> str:
     words = {
         "attempts": "scenes given up (another was drawn instead)",
-        "demos": "demos left out of the shards",
+        "demos": "demos left out",
         "goals": "candidate goals that did not hold (kept in `rejected_goals/`)",
     }
-    lines = [f"| {words[what]} | {reason} | {count} |" for what, counts in rejects.items() for reason, count in counts.items()]
-    return "\n".join(
-        ["## What was rejected\n", "| what | reason | count |", "|---|---|---|", *(lines or ["| nothing | | |"]), ""]
-    )
+    lines = [(words[what], reason, count) for what, counts in rejects.items() for reason, count in counts.items()]
+    return "## What was rejected\n\n" + (_table(["what", "reason", "count"], lines) if lines else "Nothing.\n")
 
 
-def _arrays() -> str:
-    """The table of arrays, from the one that shards are written by."""
-    lines = [
-        "## Arrays\n",
-        "Each shard is a Zarr v3 group. Ragged arrays hold the rows of all demos one after another; demo `d` is rows "
-        "`offsets[d]` to `offsets[d + 1]` of its group. `T_a_b` maps b-coordinates to a. World frame: right-handed, z up.\n",
-        "| array | dtype | rows | unit | frame | what |",
-        "|---|---|---|---|---|---|",
-    ]
+ARRAYS_HEAD = ("array", "dtype", "shape", "unit", "frame", "what")
+
+
+def _arrays() -> Iterator[tuple[str, ...]]:
+    """The lines of the table of arrays, from the one that shards are written by."""
     for column in columns():
         about = column.metadata
-        shape = " x ".join(str(dim) for dim in about["dims"])
+        dims = about["dims"] if is_ragged(column) else about["dims"][1:]
         codes = f" ({', '.join(f'{i} {name}' for i, name in enumerate(about['names']))})" if about["names"] else ""
-        cells = [f"`{about['path']}`", about["dtype"].lstrip("<|"), shape, about["unit"], about["frame"]]
-        lines.append(f"| {' | '.join(cells)} | {about['description']}{codes} |")
-    return "\n".join([*lines, ""])
+        shape = " x ".join(map(str, dims)) or "-"
+        yield (
+            f"`{about['path']}`",
+            about["dtype"].lstrip("<|"),
+            shape,
+            about["unit"],
+            about["frame"],
+            about["description"] + codes,
+        )
+
+
+DOES = {  # what a stage did; stages of other names are listed without a word
+    "demonstrate": "draws a scene, settles the object at every candidate goal, shakes the container and moves the object in",
+    "observe": "looks at container and object with noisy depth cameras and fuses what they see",
+    "cluster": "partitions the clouds into superpoints",
+    "label": "computes affordance and correspondence of the demonstrated goal",
+}
 
 
 def _how(manifest: Mapping[str, Any]) -> str:
     recipe = manifest["recipe"]
-    lines = ["## How it was made\n"]
+    lines = []
     for name, entry in manifest["stages"].items():
-        if not entry["units"]:
-            continue
-        spec, sections = entry["spec"], ", ".join(sorted(entry["spec"]["sections"]))
-        versions = ", ".join(f"{package} {number}" for package, number in sorted(spec["packages"].items()))
-        lines.append(f"- `{name}` version {spec['version']} ({versions}), recipe sections {sections}")
-    lines += [
-        "",
-        f"Seed {recipe['seed']}. The whole recipe, every default filled in, is in `manifest.json`; with it and the versions "
-        f"above the same bytes come out again. Content digest: `{manifest['content_sha256']}`.",
-        "",
-        f"Licence: {LICENSE}.",
-        "",
-    ]
-    return "\n".join(lines)
+        if entry["units"]:
+            spec, does = entry["spec"], f" {DOES[name]}" if name in DOES else ""
+            versions = ", ".join(f"{package} {number}" for package, number in sorted(spec["packages"].items()))
+            lines.append(
+                f"- `{name}`{does} (version {spec['version']}; {versions}; recipe: {', '.join(sorted(spec['sections']))})"
+            )
+    made = "\n".join(lines)
+    return f"""## How it was made
+
+{made}
+
+Seed {recipe["seed"]}. The recipe below, saved as a file and given to `dapdata generate` and then `dapdata label`, makes the
+same arrays again with the versions above; their digest is `{manifest["content_sha256"]}`.
+
+<details><summary>The recipe, every default filled in</summary>
+
+```json
+{json.dumps(recipe, indent=1)}
+```
+
+</details>
+"""

@@ -17,7 +17,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from dapdata import card, durable, manifest, rng, split, store
+from dapdata import card, croissant, durable, manifest, rng, split, store
 from dapdata.config import SplitConfig
 from dapdata.errors import CorruptionError, DapdataError, UsageError
 from dapdata.manifest import Manifest, Rejects, SplitEntry, StageEntry, UnitEntry
@@ -290,8 +290,11 @@ def publish(
 def _write(root: Path, now: Manifest, rows: Sequence[Mapping[str, Any]], previews: Mapping[str, bytes]) -> None:
     """Publishes a manifest with the files that follow from it."""
     index = {manifest.INDEX: manifest.index_bytes(rows)} if rows else {}
-    text = card.render(now.model_dump(mode="json"), rows, sorted(previews))
-    manifest.publish(root, now, {**index, **previews, manifest.CARD: text.encode()})
+    tree = now.model_dump(mode="json")
+    about = {manifest.CARD: card.render(tree, rows, sorted(previews)).encode()}
+    if rows:
+        about[manifest.CROISSANT] = croissant.render(tree, rows, index[manifest.INDEX])
+    manifest.publish(root, now, {**index, **previews, **about})
 
 
 def attach(root: Path, pictures: Mapping[str, bytes]) -> None:

@@ -11,8 +11,10 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from dapdata.records import columns, is_ragged
-from dapdata.split import SPLITS
+import numpy as np
+
+from dapdata.records import Array, columns, is_ragged
+from dapdata.split import SPLITS, UNUSED
 
 LICENSE = "cc0-1.0"  # synthetic geometry, nobody's work: the data may be used for anything
 LICENSE_URL = "https://creativecommons.org/publicdomain/zero/1.0/"
@@ -78,25 +80,34 @@ DAP = """@article{chang2024dap,
 }"""
 
 
-def render(manifest: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], previews: Sequence[str], form: Form = SHARDS) -> str:
+def render(
+    manifest: Mapping[str, Any],
+    stages: Mapping[str, Mapping[str, Any]],
+    demos: int,
+    index: Mapping[str, Array],
+    previews: Sequence[str],
+    form: Form = SHARDS,
+) -> str:
     """The card as Markdown.
 
     Args:
-        manifest: As JSON data.
-        rows: Of the index, of the demos that are there; empty before the dataset is labelled.
+        manifest: As JSON data; its shards and stages are not looked at.
+        stages: The spec of each stage whose units are there.
+        demos: How many are in the shards; 0 before the dataset is labelled.
+        index: Its columns, of the demos that are beside the card; empty before the dataset is labelled.
         previews: Paths of pictures.
         form: What is particular to the files.
     """
     parts = [
-        _header(manifest, rows, form),
-        f"# {manifest['name']}\n\n{summary(manifest, rows)}\n",
+        _header(manifest, index, form),
+        f"# {manifest['name']}\n\n{summary(manifest, demos, index)}\n",
         "".join(f"![{_alt(path)}]({path})\n" for path in previews),
-        *([f"## Read it\n\n{form.loader}", _averages(rows), _splits(rows)] if rows else [UNLABELLED]),
+        *([f"## Read it\n\n{form.loader}", _averages(index), _splits(index)] if index else [UNLABELLED]),
         _rejects(manifest["rejects"]),
         FRAMES,
         f"## Files\n\n{form.files}\n",
         *([f"## Arrays\n\n{_table(ARRAYS_HEAD, _arrays())}"] if form.has_arrays else []),
-        _how(manifest),
+        _how(manifest, stages),
         LIMITS,
         f"## Licence\n\n[{LICENSE}]({LICENSE_URL}): use it for anything.\n",
         f"## Citation\n\n```bibtex\n{citation(manifest)}\n```\n\nThe labels are those of\n\n```bibtex\n{DAP}\n```\n",
@@ -107,19 +118,19 @@ def render(manifest: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], previ
 UNLABELLED = "No shards yet: run `dapdata label` on this folder.\n"
 
 
-def summary(manifest: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> str:
-    """What the dataset is, in a sentence or two."""
+def summary(manifest: Mapping[str, Any], demos: int, index: Mapping[str, Array]) -> str:
+    """What the dataset is, in a sentence or two; arguments as in `render`."""
     what = (
         f"Demonstrations of placing an object into a container, task `{manifest['task']}`, made in simulation by dapdata "
         f"{manifest['created_by']['dapdata']}"
     )
-    if not rows:
+    if not index:
         return f"{what}: {manifest['demos']} demos, not yet labelled."
-    held = sum(shard["demos"] for shard in manifest["shards"])
-    part = f" of {held}" if len(rows) < held else ""
+    here = len(index["demo"])
     return (
-        f"{what}: {len(rows)}{part} demos, each with noisy point clouds of container and object, superpoints, every goal "
-        "that holds in physics, and the affordance and correspondence labels of the demonstrated one."
+        f"{what}: {here if here == demos else f'{here} of {demos}'} demos, each with noisy point clouds of container and "
+        "object, superpoints, every goal that holds in physics, and the affordance and correspondence labels of the "
+        "demonstrated one."
     )
 
 
@@ -136,11 +147,12 @@ def citation(manifest: Mapping[str, Any]) -> str:
     )
 
 
-def _header(manifest: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], form: Form) -> str:
-    size = next((text for limit, text in SIZES if len(rows) < limit), "n>1M")
+def _header(manifest: Mapping[str, Any], index: Mapping[str, Array], form: Form) -> str:
+    here = len(index["demo"]) if index else 0
+    size = next((text for limit, text in SIZES if here < limit), "n>1M")
     lines = [f"license: {LICENSE}", "task_categories:", "- robotics", "tags:", *(f"- {tag}" for tag in TAGS)]
     lines += [f"pretty_name: {manifest['name']}", "size_categories:", f"- {size}"]
-    lines += ["configs:", form.configs] if rows and form.configs else []
+    lines += ["configs:", form.configs] if index and form.configs else []
     return "\n".join(["---", *lines, "---"])
 
 
@@ -159,31 +171,33 @@ def _table(head: Sequence[str], lines: Iterable[Sequence[object]]) -> str:
     return "".join(f"| {' | '.join(map(str, row))} |\n" for row in rows)
 
 
-def _averages(rows: Sequence[Mapping[str, Any]]) -> str:
-    means = [(name.replace("_", " "), f"{sum(row[name] for row in rows) / len(rows):.1f}") for name in COUNTS]
+def _averages(index: Mapping[str, Array]) -> str:
+    means = [(name.replace("_", " "), f"{index[name].mean():.1f}") for name in COUNTS]
     return "## What a demo holds\n\n" + _table(["on average", ""], means)
 
 
-def _splits(rows: Sequence[Mapping[str, Any]]) -> str:
+def _splits(index: Mapping[str, Array]) -> str:
     """Demos and instances of each split, and how many instances it shares with another: none, or it would be no split."""
-    kinds = ("container_instance", "object_instance")
-    names = [name for name in (*SPLITS, "unused") if any(row["split"] == name for row in rows)]
-    found = {name: [{row[kind] for row in rows if row["split"] == name} for kind in kinds] for name in names}
-
-    def shared(name: str, kind: int) -> int:
-        others = [found[other][kind] for other in names if other != name and "unused" not in (name, other)]
-        return len(found[name][kind] & set().union(*others))
-
-    lines = [
-        (name, sum(row["split"] == name for row in rows), *map(len, found[name]), shared(name, 0), shared(name, 1))
-        for name in names
+    owners = index["split"]
+    names = [name for name in (*SPLITS, UNUSED) if name in owners]
+    instances = [
+        {name: np.unique(index[kind][owners == name]) for name in names} for kind in ("container_instance", "object_instance")
     ]
+
+    def shared(own: str, found: Mapping[str, Array]) -> int:
+        others = [found[name] for name in names if name not in (own, UNUSED)]
+        return len(np.intersect1d(found[own], np.concatenate([np.zeros(0, np.int64), *others])))
+
+    lines = []
+    for name in names:
+        overlap = ["-" if name == UNUSED else shared(name, found) for found in instances]
+        lines.append((name, int((owners == name).sum()), *(len(found[name]) for found in instances), *overlap))
     head = ["split", "demos", "containers", "objects", "containers shared with another split", "objects shared"]
     proof = (
-        "An instance is a digest of the geometry: of the container with what stands in it, and of the object. "
-        "`manifest.json` of the dataset lists those of each split, and `dapdata verify` fails if two splits share one."
+        "An instance is a digest of the geometry: of the container with what stands in it, and of the object. The dataset's "
+        "`index.parquet` has those of each demo, and `dapdata verify` fails if two splits share one."
     )
-    spare = " `unused` demos share one with two splits, and so belong to neither." if "unused" in names else ""
+    spare = " `unused` demos share one with two splits, and so belong to neither." if UNUSED in names else ""
     return f"## Splits\n\n{_table(head, lines)}\n{proof}{spare}\n"
 
 
@@ -225,16 +239,12 @@ DOES = {  # what a stage did; stages of other names are listed without a word
 }
 
 
-def _how(manifest: Mapping[str, Any]) -> str:
-    recipe = manifest["recipe"]
-    lines = []
-    for name, entry in manifest["stages"].items():
-        if entry["units"]:
-            spec, does = entry["spec"], f" {DOES[name]}" if name in DOES else ""
-            versions = ", ".join(f"{package} {number}" for package, number in sorted(spec["packages"].items()))
-            lines.append(
-                f"- `{name}`{does} (version {spec['version']}; {versions}; recipe: {', '.join(sorted(spec['sections']))})"
-            )
+def _how(manifest: Mapping[str, Any], stages: Mapping[str, Mapping[str, Any]]) -> str:
+    recipe, lines = manifest["recipe"], []
+    for name, spec in stages.items():
+        does = f" {DOES[name]}" if name in DOES else ""
+        versions = ", ".join(f"{package} {number}" for package, number in sorted(spec["packages"].items()))
+        lines.append(f"- `{name}`{does} (version {spec['version']}; {versions}; recipe: {', '.join(sorted(spec['sections']))})")
     made = "\n".join(lines)
     return f"""## How it was made
 

@@ -17,7 +17,7 @@ from hashlib import sha256
 from typing import Any
 
 from dapdata import card
-from dapdata.records import columns, is_ragged
+from dapdata.records import Array, columns, is_ragged
 
 CONTEXT = {
     "@language": "en",
@@ -72,20 +72,21 @@ SENTENCES = {  # columns of the index whose name does not say it all
 ABOUT_ARRAYS = ("path", "dtype", "shape", "unit", "frame", "description", "codes")
 
 
-def render(manifest: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], index: bytes) -> bytes:
+def render(manifest: Mapping[str, Any], folders: Sequence[str], index: Mapping[str, Array], index_file: bytes) -> bytes:
     """The description as JSON.
 
     Args:
-        manifest: As JSON data, of a labelled dataset.
-        rows: Of the index; at least one.
-        index: The index as a Parquet file.
+        manifest: As JSON data, of a labelled dataset; its shards and stages are not looked at.
+        folders: Where the shards are.
+        index: Its columns.
+        index_file: The same as a Parquet file.
     """
     tree = {
         "@context": CONTEXT,
         "@type": "sc:Dataset",
         "conformsTo": "http://mlcommons.org/croissant/1.0",
         "name": manifest["name"],
-        "description": card.summary(manifest, rows),
+        "description": card.summary(manifest, len(index["demo"]), index),
         "license": card.LICENSE_URL,
         "citeAs": card.citation(manifest),
         "creator": {"@type": "sc:Organization", "name": "dapdata"},
@@ -95,14 +96,13 @@ def render(manifest: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], index
         "rai:dataCollectionType": "Software Collection",
         "rai:dataLimitation": "Ideal solids without texture; modelled depth noise; one object; containers do not move.",
         "rai:personalSensitiveInformation": "None: nothing in it was recorded.",
-        "distribution": _distribution(manifest, index),
-        "recordSet": [_demos(rows[0]), _arrays()],
+        "distribution": _distribution(folders, index_file),
+        "recordSet": [_demos(index), _arrays()],
     }
     return json.dumps(tree, indent=1, ensure_ascii=False).encode() + b"\n"
 
 
-def _distribution(manifest: Mapping[str, Any], index: bytes) -> list[dict[str, Any]]:
-    folders = sorted({shard["path"].rpartition("/")[0] for shard in manifest["shards"]})
+def _distribution(folders: Sequence[str], index_file: bytes) -> list[dict[str, Any]]:
     return [
         {
             "@type": "cr:FileObject",
@@ -110,9 +110,9 @@ def _distribution(manifest: Mapping[str, Any], index: bytes) -> list[dict[str, A
             "name": INDEX,
             "description": "One row per demo: where it is, its split, instances and counts.",
             "contentUrl": INDEX,
-            "contentSize": f"{len(index)} B",
+            "contentSize": f"{len(index_file)} B",
             "encodingFormat": "application/x-parquet",
-            "sha256": sha256(index).hexdigest(),
+            "sha256": sha256(index_file).hexdigest(),
         },
         {
             "@type": "cr:FileSet",
@@ -125,7 +125,7 @@ def _distribution(manifest: Mapping[str, Any], index: bytes) -> list[dict[str, A
     ]
 
 
-def _demos(row: Mapping[str, Any]) -> dict[str, Any]:
+def _demos(index: Mapping[str, Array]) -> dict[str, Any]:
     """The index as a record set."""
     fields = [
         {
@@ -133,10 +133,10 @@ def _demos(row: Mapping[str, Any]) -> dict[str, Any]:
             "@id": f"demos/{name}",
             "name": name,
             "description": SENTENCES.get(name, name.replace("_", " ")),
-            "dataType": "sc:Text" if isinstance(value, str) else "sc:Integer",
+            "dataType": "sc:Text" if column.dtype.kind == "U" else "sc:Integer",
             "source": {"fileObject": {"@id": INDEX}, "extract": {"column": name}},
         }
-        for name, value in row.items()
+        for name, column in index.items()
     ]
     return {"@type": "cr:RecordSet", "@id": "demos", "name": "demos", "key": {"@id": "demos/demo"}, "field": fields}
 

@@ -74,8 +74,8 @@ def arrays_of(sample: dict[str, Array]) -> dict[str, Array]:
 
 
 def numbers_of(sample: dict[str, Array]) -> dict[str, Any]:
-    """Single numbers by the name that exports give them: those of meta/ are columns of the index."""
-    return {path.removeprefix("meta/"): array.item() for path, array in sample.items() if not array.ndim}
+    """What every full export holds as single numbers."""
+    return {path: array.item() for path, array in sample.items() if not array.ndim}
 
 
 # WebDataset ------------------------------------------------------------------------------------------------
@@ -128,8 +128,7 @@ def test_parquet_holds_every_demo_as_it_is_in_the_shards(made: dict[str, Path], 
             stored = dataset[number]
             for column in records.columns():
                 path = column.metadata["path"]
-                if not path.startswith("meta/"):
-                    assert same(as_array(row[path], column.metadata), stored[path]), path
+                assert same(as_array(row[path], column.metadata), stored[path]), path
             assert numbers_of(stored).items() <= row.items()
 
 
@@ -139,10 +138,9 @@ def test_parquet_tells_units_and_frames_and_has_small_groups_with_an_index(made:
     file = pq.ParquetFile(made["parquet"] / "data/train-00000-of-00002.parquet")
     for column in records.columns():
         about = column.metadata
-        if not about["path"].startswith("meta/"):
-            told = file.schema_arrow.field(about["path"]).metadata
-            assert (told[b"unit"].decode(), told[b"frame"].decode()) == (about["unit"], about["frame"])
-            assert json.loads(told[b"names"]) == list(about["names"])
+        told = file.schema_arrow.field(about["path"]).metadata
+        assert (told[b"unit"].decode(), told[b"frame"].decode()) == (about["unit"], about["frame"])
+        assert json.loads(told[b"names"]) == list(about["names"])
     group = file.metadata.row_group(0)
     columns = [group.column(i) for i in range(group.num_columns)]
     assert group.num_rows <= parquet.ROWS
@@ -191,7 +189,7 @@ def test_datasets_reads_every_demo_as_it_is_in_the_shards(
         assert demos[0]["preview"].size == (2 * parquet.PANEL[0], parquet.PANEL[1])
         doubles = demos.with_format("numpy", dtype=np.float64)
         for row, streams, lists, number in zip(doubles, streamed[split], demos, in_split(dataset, split), strict=True):
-            for column in (c.metadata for c in records.columns() if not c.metadata["path"].startswith("meta/")):
+            for column in (c.metadata for c in records.columns()):
                 stored = dataset[number][column["path"]]
                 assert same(np.asarray(row[column["path"]], np.float64), stored.astype(np.float64)), column["path"]
                 assert same(as_array(lists[column["path"]], column), stored), column["path"]

@@ -24,13 +24,12 @@ import numpy as np
 from dapdata import __version__, card, durable, loading, manifest
 from dapdata.errors import FormatError, MissingExtraError, UsageError
 from dapdata.loading import Dataset
-from dapdata.records import Array, columns
+from dapdata.records import Array
 from dapdata.split import SPLITS, UNUSED
-from dapdata.store import Sample
+from dapdata.store import COLUMNS, Sample
 
 ABOUT = "export.json"
 PLACES = ("shard", "row")  # columns of the index that mean nothing outside of the dataset's folder
-META = "meta/"  # arrays that are columns of the index too
 
 Progress = Callable[[int, int], None]  # demos done, demos in all
 Row = tuple[dict[str, Any], Sample]  # what the index tells of a demo, and its arrays by path
@@ -116,20 +115,26 @@ def facts(dataset: Dataset, number: int) -> dict[str, Any]:
     return {name: column[number].item() for name, column in dataset.index.items() if name not in PLACES}
 
 
-def is_scalar(path: str, array: Array) -> bool:
-    """Whether a demo's array is a single number that the index doesn't tell."""
-    return array.ndim == 0 and not path.startswith(META)
-
-
 def readme(chosen: Chosen, form: card.Form) -> dict[str, bytes]:
     """The dataset's card with what is particular to a format, and its pictures, by path."""
-    dataset = chosen.dataset
-    rows = [facts(dataset, number) for numbers in chosen.splits.values() for number in numbers.tolist()]
-    pictures = {
-        path: (dataset.root / path).read_bytes() for path in dataset.manifest.files if path.startswith(f"{manifest.PREVIEWS}/")
-    }
-    text = card.render(dataset.manifest.model_dump(mode="json"), rows, sorted(pictures), form)
+    dataset, found = chosen.dataset, chosen.dataset.manifest
+    numbers = np.concatenate([*chosen.splits.values()])
+    pictures = {path: (dataset.root / path).read_bytes() for path in found.files if path.startswith(f"{manifest.PREVIEWS}/")}
+    text = card.render(
+        found.model_copy(update={"shards": [], "stages": {}}).model_dump(mode="json"),
+        {name: entry.spec for name, entry in found.stages.items() if entry.units},
+        sum(shard.demos for shard in found.shards),
+        {name: column[numbers] for name, column in dataset.index.items()},
+        sorted(pictures),
+        form,
+    )
     return {manifest.CARD: text.encode(), **pictures}
+
+
+def described(dataset: Dataset) -> dict[str, Mapping[str, Any]]:
+    """What is known of each array of a dataset by its path: dtype, dims, unit, frame, description, names of codes."""
+    sample = dataset[0]
+    return {path: column.metadata for path, column in COLUMNS.items() if path in sample}
 
 
 # The folder ------------------------------------------------------------------------------------------------
@@ -185,7 +190,7 @@ def _about(export: Export) -> dict[str, Any]:
             "content_sha256": found.content_sha256,
             "recipe_sha256": found.recipe_sha256,
         },
-        "arrays": {column.metadata["path"]: dict(column.metadata) for column in columns()},
+        "arrays": {path: dict(told) for path, told in described(export.chosen.dataset).items()},
         "created_by": {"dapdata": __version__},
     }
     return dict(json.loads(json.dumps(about)))

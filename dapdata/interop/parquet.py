@@ -25,8 +25,8 @@ import numpy as np
 from dapdata import pictures
 from dapdata.card import Form
 from dapdata.errors import require
-from dapdata.interop.export import META, PLACES, Chosen, Export, Piece, Progress, Row, choose, cut, demo_name, readme, run
-from dapdata.records import Array, columns, is_ragged
+from dapdata.interop.export import PLACES, Chosen, Export, Piece, Progress, Row, choose, cut, demo_name, described, readme, run
+from dapdata.records import Array
 
 SHARD_SIZE = 1000  # demos in a file
 ROWS = 32  # in a row group: 4 to 30 MB
@@ -106,21 +106,18 @@ def schema(chosen: Chosen, previews: bool) -> Any:
     picture = [pa.field(PREVIEW, pa.struct({"bytes": pa.binary(), "path": pa.string()}))] if previews else []
     features: dict[str, Any] = {PREVIEW: {"_type": "Image"}} if previews else {}
     fields = [first, *picture, *others]
-    for column in columns():
-        about = column.metadata
-        if about["path"].startswith(META):
-            continue
+    for path, about in described(chosen.dataset).items():
         kind = pa.from_numpy_dtype(about["dtype"])
         told = {name: about[name] for name in ("unit", "frame", "description")} | {"names": json.dumps(about["names"])}
-        shape = [None if isinstance(size, str) else size for size in about["dims"][0 if is_ragged(column) else 1 :]]
+        shape = [None if isinstance(size, str) else size for size in about["dims"] if size != "demo"]
         for _ in shape:
             kind = pa.list_(kind)
         if len(shape) > 1:
             value = np.dtype(about["dtype"]).name
-            features[about["path"]] = {"shape": shape, "dtype": value, "_type": f"Array{len(shape)}D"}
+            features[path] = {"shape": shape, "dtype": value, "_type": f"Array{len(shape)}D"}
             told["ARROW:extension:name"] = f"datasets.features.features.Array{len(shape)}DExtensionType"
             told["ARROW:extension:metadata"] = json.dumps([shape, value])
-        fields.append(pa.field(about["path"], kind, metadata=told))
+        fields.append(pa.field(path, kind, metadata=told))
     return pa.schema(fields, metadata={"huggingface": json.dumps({"info": {"features": features}})})
 
 

@@ -18,7 +18,7 @@ import numpy as np
 
 from dapdata import durable
 from dapdata.card import Form
-from dapdata.interop.export import META, Chosen, Export, Piece, Progress, Row, choose, cut, demo_name, is_scalar, readme, run
+from dapdata.interop.export import Chosen, Export, Piece, Progress, Row, choose, cut, demo_name, readme, run
 from dapdata.records import Array
 
 SHARD_SIZE = 500  # demos: 70 to 500 MB, as cameras have it; fewer and larger files stream better
@@ -61,10 +61,10 @@ def _write(piece: Piece, file: Path, rows: Iterator[Row]) -> None:
     with tarfile.open(file, "w", format=tarfile.USTAR_FORMAT) as tar:
         for about, sample in rows:
             key = demo_name(about["demo"])
-            numbers = {path: array.item() for path, array in sample.items() if is_scalar(path, array)}
+            numbers = {path: array.item() for path, array in sample.items() if not array.ndim}
             _add(tar, f"{key}.json", durable.canonical(about | numbers))
             for path, array in sample.items():
-                if not (path.startswith(META) or is_scalar(path, array)):
+                if array.ndim:
                     _add(tar, f"{key}.{member_name(path)}", _npy(array))
 
 

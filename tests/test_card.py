@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 from fnmatch import fnmatch
@@ -127,6 +128,17 @@ def test_card_and_description_belong_to_the_dataset_and_come_back_the_same(toy_c
     make_toy(toy_copy)
     assert {name: (toy_copy / name).read_bytes() for name in files} == files
     assert health.verify(toy_copy).ok
+
+
+def test_a_copy_without_the_cached_stages_is_whole_and_says_what_it_cannot(toy_copy: Path) -> None:
+    shutil.rmtree(toy_copy / "stages/observe")
+    assert not health.verify(toy_copy, quick=True).ok  # a part of the cache is damage, none of it a choice
+    shutil.rmtree(toy_copy / "stages")
+    found = health.verify(toy_copy)
+    assert found.ok
+    assert "cannot be labelled again" in found.notes[0]
+    (toy_copy / manifest.read(toy_copy).shards[0].path / "zarr.json").unlink()
+    assert not health.verify(toy_copy).ok
 
 
 # Croissant -------------------------------------------------------------------------------------------------

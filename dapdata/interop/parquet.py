@@ -82,7 +82,7 @@ def _form(chosen: Chosen) -> Form:
         ),
         loader=f"""```python
 from datasets import load_dataset
-demos = load_dataset(".", split="{next(iter(chosen.splits))}").with_format("numpy")
+demos = load_dataset("parquet", data_files="data/{next(iter(chosen.splits))}-*.parquet", split="train").with_format("numpy")
 points, goals = demos[0]["container/points"], demos[0]["goals/T_world_object"]
 ```
 """,

@@ -580,6 +580,20 @@ def _export(kind: str, dataset: Path | None, out: Path, as_json: bool, **options
 # Around ----------------------------------------------------------------------------------------------------
 
 
+@app.command(epilog="Example: dapdata doctor --out /data/mine --extra sim")
+def doctor(
+    out: Annotated[Path, typer.Option("--out", help="Where datasets are to be written.", metavar="DIR")] = Path("data"),
+    extra: Annotated[list[str] | None, _option("--extra", help="An extra that must be there; may be repeated")] = None,
+    as_json: Json = False,
+) -> int:
+    """Say what is installed, what the machine offers, and what to do about what is missing."""
+    from dapdata.doctor import examine
+
+    found = examine(out, extra or ())
+    show(found.to_dict(), as_json, str(found))
+    return 0 if found.ok else 6
+
+
 @app.command(epilog="Example: dapdata bench --scale quick")
 def bench(
     against: Annotated[str | None, _option("--against", help="Only benchmarks that know this rival")] = None,

@@ -115,9 +115,15 @@ def replace_file(path: Path, data: bytes) -> None:
     make_folder(path.parent)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     temporary.write_bytes(data)
-    _fsync(temporary)
-    _rename(temporary, path)
-    _fsync(path.parent)
+    move_file(temporary, path)
+
+
+def move_file(source: Path, target: Path) -> None:
+    """Moves a file to its place for good, in the place of what has that name."""
+    make_folder(target.parent)
+    _fsync(source)
+    _rename(source, target)
+    _fsync(target.parent)
 
 
 def remove_file(path: Path) -> None:

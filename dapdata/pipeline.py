@@ -15,6 +15,7 @@ import shutil
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -172,11 +173,11 @@ class _Command:
     resolved: dict[str, Any]
     specs: dict[str, Spec]
 
-    @property
+    @cached_property
     def layout(self) -> Layout:
         return units.layout_of(self.root, self.stages, self.specs, self.resolved)
 
-    @property
+    @cached_property
     def units(self) -> list[Unit]:
         return units_of(self.resolved["demos"], self.resolved["shard_size"])
 

@@ -82,15 +82,14 @@ def before(root: Path) -> Before | None:
 
 def missing(layout: Layout, stage: str, units: Sequence[Unit]) -> list[Unit]:
     """The units of a stage that are not there."""
-    return [unit for unit in units if not store.is_committed(layout.folder(stage, unit))]
+    paths = [layout.path(stage, unit) for unit in units]
+    there = store.committed(layout.root, paths)
+    return [unit for unit, path in zip(units, paths) if path not in there]
 
 
 def measured_cost(root: Path, reference: Mapping[str, Cost]) -> dict[str, Cost]:
     """Seconds and bytes a demo in each stage: as last measured on this dataset, or else the reference."""
-    try:
-        lines = [json.loads(line) for line in (root / manifest.LOG).read_text().splitlines()[-LOG_LINES:]]
-    except (OSError, ValueError):
-        lines = []
+    lines = list(manifest.read_log(root, LOG_LINES))
     costs = dict(reference)
     for stage in reference:
         mine = [line for line in lines if line.get("stage") == stage and line["demos"]]

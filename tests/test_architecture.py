@@ -20,7 +20,7 @@ DAPTRAIN = sorted((ROOT / "train/daptrain").rglob("*.py"))
 LINES = (
     ("errors", "rng", "poses", "config"),
     ("records", "strict_yaml", "durable", "clouds", "console"),
-    ("solids", "meshes", "keys", "slic", "split", "matching"),
+    ("solids", "meshes", "keys", "slic", "split", "matching", "tables"),
     ("tabletop",),
     ("tasks",),
     ("simulate", "observe", "cluster", "labels"),
@@ -31,7 +31,7 @@ LINES = (
     ("loading", "draw", "schemas"),
     ("metrics", "health", "pictures"),
     ("viewer",),
-    ("show", "bench", "interop"),
+    ("show", "bench", "doctor", "interop"),
     ("cli",),
     ("__main__",),
 )

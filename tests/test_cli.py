@@ -70,7 +70,7 @@ def test_every_command_has_help_with_an_example(name: str, capsys: pytest.Captur
 def test_the_commands_are_those_of_the_interface() -> None:
     assert set(COMMANDS) == {
         "init", "generate", "label", "train", "eval", "judge", "predict", "run", "status", "inspect", "verify", "show", "gc",
-        "schema", "bench", "compare", "export",
+        "schema", "bench", "compare", "doctor", "export",
     }  # fmt: skip
 
 

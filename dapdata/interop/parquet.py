@@ -99,7 +99,7 @@ def schema(chosen: Chosen, previews: bool) -> Any:
 
     index = chosen.dataset.index
     first, *others = [
-        pa.field(name, pa.string() if column.dtype.kind == "U" else pa.int64())
+        pa.field(name, pa.int64() if column.dtype.kind == "i" else pa.string())
         for name, column in index.items()
         if name not in PLACES
     ]

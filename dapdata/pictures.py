@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from dapdata import errors, records
 from dapdata.draw import POINT_RADIUS, Camera, Canvas, blank, draw_ground, draw_solids, frame, image, lit, paint, splat
+from dapdata.poses import facing
 
 Array = NDArray[Any]
 Sample = Mapping[str, Array]
@@ -53,9 +54,7 @@ class Shown:
 
 def front_view(sample: Sample, width: int, height: int) -> Camera:
     """The camera in front of the container's opening, a little aside and above, with the container in the picture."""
-    T_world_container = sample["pose/T_world_container"]
-    out = T_world_container[:3, :3] @ sample["scene/opening"]
-    out = np.array([out[0], out[1], 0.0])
+    out = facing(sample["pose/T_world_container"], sample["scene/opening"])
     aside = np.array([out[1], -out[0], 0.0])  # to the viewer's left of the opening's direction
     return frame(sample["container/points"].astype(float), out - SIDE * aside + [0, 0, ABOVE], width, height)
 

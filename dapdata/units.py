@@ -239,7 +239,7 @@ def _row(demo: int, sample: store.Sample, is_shard: bool) -> dict[str, Any]:
 
 def describe(sample: store.Sample) -> dict[str, int]:
     """Seed, instances and counts of one demo."""
-    meta = {name: int(sample[f"meta/{name}"]) for name in ("seed", "container_instance", "object_instance", "attempts")}
+    meta = {name: int(sample[f"meta/{name}"]) for name in ("seed", "container_instance", "object_instance", "attempts", "task")}
     counts = {name: len(sample[path]) for name, path in COUNTED.items()}
     return meta | counts | {"positives": int((sample["container_superpoints/affordance"] > 0).sum())}
 
@@ -345,12 +345,13 @@ def _index_rows(
     recipe: Mapping[str, Any], shards: Sequence[UnitEntry], records: Sequence[Mapping[str, Any]], config: SplitConfig
 ) -> Iterator[dict[str, Any]]:
     """The rows of the index, in demo order."""
+    names = [scene["task"] for scene in recipe["scene"].get("scenes", [recipe["scene"]])]
     instances = ((r["demo"], r["container_instance"], r["object_instance"]) for record in records for r in record["rows"])
     splits = split.assign(recipe["demos"], instances, config, recipe["seed"])
     for shard, record in zip(shards, records):
         for number, row in enumerate(record["rows"]):
-            place = {"split": splits[row["demo"]], "shard": shard.path, "row": number, "task": recipe["scene"]["task"]}
-            yield {"demo": row["demo"], **place, **{k: v for k, v in row.items() if k != "demo"}}
+            place = {"split": splits[row["demo"]], "shard": shard.path, "row": number, "task": names[row["task"]]}
+            yield {"demo": row["demo"], **place, **{k: v for k, v in row.items() if k not in ("demo", "task")}}
 
 
 def _splits(rows: Sequence[Mapping[str, Any]]) -> dict[str, SplitEntry]:

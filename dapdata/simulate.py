@@ -234,7 +234,7 @@ def _reason_before(world: _World, T: Array, config: PlacementConfig) -> str:
     contacts = world.contacts(T, config.support_gap)
     if _depth(contacts) > config.max_penetration:
         return "penetrates"
-    return "ok" if _is_supported(contacts) else "unsupported"
+    return "ok" if world.is_held(T, contacts) else "unsupported"
 
 
 def _reason_after(world: _World, T_before: Array, T: Array, speed: float, config: PlacementConfig) -> str:
@@ -251,7 +251,7 @@ def _reason_after(world: _World, T_before: Array, T: Array, speed: float, config
     contacts = world.contacts(T, config.support_gap)
     if _depth(contacts) > config.max_penetration:
         return "penetrates"
-    return "ok" if _is_supported(contacts) else "unsupported"
+    return "ok" if world.is_held(T, contacts) else "unsupported"
 
 
 def _shake(world: _World, bodies: Sequence[int], config: PlacementConfig) -> tuple[Array, Array]:
@@ -275,6 +275,7 @@ class _Contact(NamedTuple):
 
     distance: float  # m, negative where they overlap
     normal: Array  # (3,) unit, from the part to the object
+    height: float  # m, container frame, of the point on the part
 
 
 @dataclass(frozen=True)
@@ -362,15 +363,15 @@ def _verdict(
 ) -> Verdict:
     """What is said about an object that was let go and ended at T (container frame)."""
     moved, turned = world.difference(T, trial.T)
-    is_touching = bool(world.contacts(T, TOUCH))
-    failed = {"not_touching": not is_touching}
+    contacts = world.contacts(T, TOUCH)
+    failed = {"not_touching": not contacts}
     if protocol == "strict":
         failed = {
             "outside": not world.is_inside(T),
             "moved": moved > config.max_shift,
             "turned": turned > np.radians(config.max_turn_deg),
             "tilted": world.tilt(T) > world.max_tilt,
-            "not_touching": not is_touching,
+            "not_touching": not (world.is_held(T, contacts) if world.hangs else contacts),
             "not_at_rest": speed > config.max_speed,
         }
     elif world.symmetry == "revolution":
@@ -418,11 +419,6 @@ def _push(contacts: Sequence[_Contact]) -> float:
     return PUSH_STIFFNESS * max(_depth(contacts), 0.0)
 
 
-def _is_supported(contacts: Sequence[_Contact]) -> bool:
-    """Whether one of the contacts holds the object up."""
-    return any(contact.normal[2] > SUPPORTING for contact in contacts)
-
-
 # ---------------------------------------------------------------- PyBullet
 
 
@@ -453,7 +449,7 @@ class _World:
 
     def __init__(self, scene: Scene | Demo, config: PlacementConfig, exhaustive: bool = False) -> None:
         self._places, self._ways_out = _places(scene), np.asarray(scene.goal_approach, np.float64)
-        self._hangs, self._opens_up = _hangs(scene), bool(scene.opening[2] > SUPPORTING)
+        self.hangs, self._opens_up = _hangs(scene), bool(scene.opening[2] > SUPPORTING)
         self.max_tilt = float(scene.max_tilt)
         self.symmetry = SYMMETRIES[int(scene.symmetry_kind)]
         self._axis = np.asarray(scene.symmetry_axis, np.float64)
@@ -494,7 +490,7 @@ class _World:
         )
         if self._config.friction != 0.5:  # PyBullet's default
             b.changeDynamics(body, -1, lateralFriction=self._config.friction, physicsClientId=self._client)
-        if self._hangs:
+        if self.hangs:
             rolling = {"rollingFriction": HANG_ROLLING, "spinningFriction": HANG_ROLLING}
             b.changeDynamics(body, -1, **rolling, physicsClientId=self._client)
         return body
@@ -565,7 +561,7 @@ class _World:
         found = []
         for p in parts:
             for point in b.getClosestPoints(self._probe, self._parts[p], reach, physicsClientId=client):
-                found.append(_Contact(point[8], np.array(point[7])))
+                found.append(_Contact(point[8], np.array(point[7]), point[6][2]))
         return found
 
     def way_out(self, T: Array) -> Array:
@@ -577,7 +573,7 @@ class _World:
 
         Around what hangs there is a handle: contacts tell how far that can be raised.
         """
-        if self._hangs:
+        if self.hangs:
             return self._free_height_of_hanging(T)
         low, high = self._object_bounds(T)
         over = np.all((self._bounds[:, 0, :2] < high[:2]) & (self._bounds[:, 1, :2] > low[:2]), axis=1)
@@ -600,6 +596,14 @@ class _World:
         x, y, z = T[:3, 3]
         point = np.array([x, y, self._object_bounds(T)[0, 2] + RIM if self._opens_up else z])
         return bool(np.all((point >= self._inside[0]) & (point <= self._inside[1])))
+
+    def is_held(self, T: Array, contacts: Sequence[_Contact]) -> bool:
+        """Whether one of the contacts holds the object up; what hangs, from above its centre of mass.
+
+        A mug that stands at the foot of its rack does not hang.
+        """
+        lowest = (T @ self._T_object_body)[2, 3] if self.hangs else -np.inf
+        return any(contact.normal[2] > SUPPORTING and contact.height > lowest for contact in contacts)
 
     def difference(self, T_a: Array, T_b: Array) -> tuple[float, float]:
         """Distance (m) and angle (rad) between two poses modulo the object's symmetry."""

@@ -257,6 +257,16 @@ def test_what_falls_off_a_peg_is_no_goal():
     assert reason_of(ring_on_a_peg(0, aside=0.05)) == "unsupported", "it fell to the floor: the candidate is judged as proposed"
 
 
+def test_what_stands_at_the_foot_of_its_peg_does_not_hang():
+    scene = ring_on_a_peg(0)
+    demo = demonstrate(scene, CONFIG, rng.stream(0, "test", 0))
+    assert isinstance(demo, Demo)
+    lying = pose(rotation_about((0, 1, 0), np.pi / 2), (0.1, 0.1, 0.0055))
+    on_the_floor = replace(demo, goal_approach=np.array([[0.0, 0, 1]]))
+    assert verdict_on(on_the_floor, lying).reason == "not_touching"
+    assert verdict_on(replace(on_the_floor, goal_kind=np.zeros(1, np.uint8)), lying).success
+
+
 def test_a_ring_is_lifted_no_higher_than_its_peg_lets_it():
     demo = demonstrate(ring_on_a_peg(0), CONFIG, rng.stream(0, "test", 0))
     assert isinstance(demo, Demo)

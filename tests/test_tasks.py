@@ -144,11 +144,11 @@ def test_candidates_differ(task):
 
 @each_task
 def test_goals_settle_where_they_were_proposed(task):
-    """A task proposes places that hold; some may be barred or shaky. On a peg they hold in another pose, if at all."""
+    """A task proposes places that hold; some may be barred or shaky. On a peg they hold in another pose."""
     assert len(demos(task)) >= SCENES - 2
     hangs = any(GOAL_KINDS[kind] == "peg" for demo in demos(task) for kind in demo.goal_kind)
     lost = Counter(REJECT_REASONS[code] for demo in demos(task) for code in demo.rejected_reason)
-    assert set(lost) <= {"unreachable", "shaken_off"} | ({"penetrates"} if hangs else set())
+    assert set(lost) <= {"unreachable", "shaken_off"}
     most_shift, most_turn = (HANG_SHIFT, np.pi / 3) if hangs else (0.002, 0.01)
     by_start = {scene.T_world_object_start.tobytes(): scene for scene in scenes(task)}
     for demo in demos(task):

@@ -44,7 +44,7 @@ class Params(TabletopConfig):
     clearance: LengthRange = key((0.004, 0.012), "play of a plate in a gap, one draw a gap", unit="m")
     narrow: ShareRange = key((0.1, 0.3), "share of the gaps that are too narrow, one draw a scene")
     narrow_width: ShareRange = key((0.6, 0.9), "width of those, in thicknesses of a plate")
-    occupancy: ShareRange = key((0.3, 0.6), "share of the other gaps that hold a plate, one draw a scene")
+    occupancy: ShareRange = key((0.2, 0.5), "share of the other gaps that hold a plate, one draw a scene")
 
     @model_validator(mode="after")
     def check_sizes(self) -> Params:

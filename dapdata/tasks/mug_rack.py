@@ -23,7 +23,7 @@ from pydantic import model_validator
 
 from dapdata import solids
 from dapdata.config import CoordinateRange, DegreesRange, PositiveCountRange, ShareRange, SizeRange, key
-from dapdata.poses import inverse, pose, rotation_about
+from dapdata.poses import inverse, pose, rotation_about, transform
 from dapdata.records import Rejected, Scene
 from dapdata.solids import Part, box, cylinder
 from dapdata.tabletop import HOVER, Candidate, TabletopConfig, build_scene
@@ -31,7 +31,8 @@ from dapdata.tabletop import HOVER, Candidate, TabletopConfig, build_scene
 Array = NDArray[Any]
 
 STAVES, SEGMENTS = 8, 7  # flat pieces of a mug's wall and of its handle; with the bottom as many as the simulator takes
-MARGIN = 0.003  # m that a mug keeps from the pole and from the table where it begins
+MARGIN = 0.005  # m that a mug keeps from its pole, and from the table (and from a foot on it), where it begins
+STEP = 0.01  # m further out along the peg, if something is in the way
 
 
 class Params(TabletopConfig):
@@ -94,31 +95,45 @@ class Mug:
 
 @dataclass(frozen=True)
 class Peg:
-    """A peg in the frame of its rack (origin at the pole's foot), m."""
+    """A peg in the frame of the row of racks, m. It is welded into its pole: it begins on the pole's axis."""
 
-    root: Array  # (3,) on the pole's axis
+    root: Array  # (3,)
     way: Array  # (3,) unit, from the root to the tip
     radius: float
     length: float
+
+    @property
+    def part(self) -> Part:
+        """Its cylinder."""
+        up = np.array([0.0, 0.0, 1.0])
+        turn = rotation_about(np.cross(up, self.way), float(np.arccos(self.way[2])))
+        return cylinder(self.radius, self.length, self.root + self.way * self.length / 2, rotation=turn)
+
+
+@dataclass(frozen=True)
+class Rack:
+    """A pole on its foot, if it has one, with pegs; in the frame of the row of racks."""
+
+    foot: tuple[Part, ...]
+    pole: Part
+    pegs: tuple[Peg, ...]
 
 
 def sample_scene(params: Params, rng: np.random.Generator) -> Scene | Rejected:
     """Racks and a mug that one of their pegs takes at least; Rejected where none does."""
     mug = _mug(params, rng)
-    parts: list[Part] = []
-    hung: list[tuple[Array, Array, float]] = []  # pose of the mug, way out, clearance
-    for T_row_rack in _rack_poses(params, rng):
-        pole_radius, rack, pegs = _rack(params, rng)
-        parts += solids.moved(rack, T_row_rack)
-        for peg in pegs:
-            clearance = min(mug.depth, mug.room) - 2 * peg.radius
-            if clearance >= params.min_clearance:
-                way_out = T_row_rack[:3, :3] @ peg.way
-                hung += [(T_row_rack @ T, way_out, clearance) for T in _hanging(mug, peg, pole_radius)]
+    racks = [_rack(params, T_row_rack, rng) for T_row_rack in _rack_poses(params, rng)]
+    parts = [part for rack in racks for part in (*rack.foot, rack.pole, *(peg.part for peg in rack.pegs))]
     things = _mug_parts(mug)
     T_container_row, T_object_mug = _to_footprint(parts), _to_middle(things)
+    candidates = [
+        _candidate(T_container_row @ T_row_mug @ inverse(T_object_mug), peg, mug)
+        for rack in racks
+        for peg in rack.pegs
+        if _play(mug, peg) >= params.min_clearance
+        for T_row_mug in _hanging(mug, things, peg, rack, racks)
+    ]
     parts, things = solids.moved(parts, T_container_row), solids.moved(things, T_object_mug)
-    candidates = [_candidate(T_container_row @ T @ inverse(T_object_mug), way_out, play) for T, way_out, play in hung]
     return build_scene(params, parts, things, candidates, "none", rng)
 
 
@@ -134,9 +149,14 @@ def _to_footprint(parts: Sequence[Part]) -> Array:
     return pose(None, (x, y, 0.0))
 
 
-def _candidate(T_container_object: Array, way_out: Array, clearance: float) -> Candidate:
+def _candidate(T_container_object: Array, peg: Peg, mug: Mug) -> Candidate:
     x, y, z = T_container_object[:3, 3].tolist()
-    return Candidate((x, y, z), "peg", clearance, T_container_object[:3, :3], way_out)
+    return Candidate((x, y, z), "peg", _play(mug, peg), T_container_object[:3, :3], peg.way)
+
+
+def _play(mug: Mug, peg: Peg) -> float:
+    """What a peg leaves of the room in the handle, m."""
+    return min(mug.depth, mug.room) - 2 * peg.radius
 
 
 def _rack_poses(params: Params, rng: np.random.Generator) -> list[Array]:
@@ -151,14 +171,15 @@ def _rack_poses(params: Params, rng: np.random.Generator) -> list[Array]:
     ]
 
 
-def _rack(params: Params, rng: np.random.Generator) -> tuple[float, list[Part], list[Peg]]:
-    """Radius of the pole, parts and pegs of a rack that stands at the origin."""
+def _rack(params: Params, T_row_rack: Array, rng: np.random.Generator) -> Rack:
+    """A rack at a pose in the row."""
     radius, height = rng.uniform(*params.pole_radius), rng.uniform(*params.pole_height)
     foot = _foot(params, rng)
     thickness = foot[0].size[2] if foot else 0.0
     pole = cylinder(radius, height - thickness, (0, 0, (height + thickness) / 2))
-    pegs = [_peg(params, height, rng) for _ in range(int(rng.integers(*params.pegs, endpoint=True)))]
-    return radius, [*foot, pole, *(_peg_part(peg) for peg in pegs)], pegs
+    pegs = [_peg(params, height, T_row_rack, rng) for _ in range(int(rng.integers(*params.pegs, endpoint=True)))]
+    *foot, pole = solids.moved([*foot, pole], T_row_rack)
+    return Rack(tuple(foot), pole, tuple(pegs))
 
 
 def _foot(params: Params, rng: np.random.Generator) -> list[Part]:
@@ -172,18 +193,13 @@ def _foot(params: Params, rng: np.random.Generator) -> list[Part]:
     ]
 
 
-def _peg(params: Params, height: float, rng: np.random.Generator) -> Peg:
+def _peg(params: Params, height: float, T_row_rack: Array, rng: np.random.Generator) -> Peg:
+    """A peg of a rack of some height, m."""
     angle, yaw = np.radians(rng.uniform(*params.peg_angle_deg)), np.radians(rng.uniform(*params.peg_yaw_deg))
     way = np.array([np.sin(angle) * np.cos(yaw), np.sin(angle) * np.sin(yaw), np.cos(angle)])
     root = np.array([0, 0, rng.uniform(*params.peg_height) * height])
-    return Peg(root, way, rng.uniform(*params.peg_radius), rng.uniform(*params.peg_length))
-
-
-def _peg_part(peg: Peg) -> Part:
-    """The peg's cylinder, welded into the pole: it begins on the pole's axis."""
-    up = np.array([0.0, 0.0, 1.0])
-    turn = rotation_about(np.cross(up, peg.way), float(np.arccos(peg.way[2])))
-    return cylinder(peg.radius, peg.length, peg.root + peg.way * peg.length / 2, rotation=turn)
+    radius, length = rng.uniform(*params.peg_radius), rng.uniform(*params.peg_length)
+    return Peg(T_row_rack[:3, :3] @ root + T_row_rack[:3, 3], T_row_rack[:3, :3] @ way, radius, length)
 
 
 def _mug(params: Params, rng: np.random.Generator) -> Mug:
@@ -222,10 +238,18 @@ def _handle_parts(mug: Mug) -> Iterator[Part]:
         yield box((length, mug.width, mug.thickness), (start + end) / 2, rotation=turn)
 
 
-def _hanging(mug: Mug, peg: Peg, pole_radius: float) -> list[Array]:
-    """(4, 4) T_rack_mug where a mug begins to hang: square on the peg, close to the pole, opening to either side; or none.
+def _hanging(mug: Mug, things: Sequence[Part], peg: Peg, rack: Rack, racks: Sequence[Rack]) -> Iterator[Array]:
+    """(4, 4) T_row_mug where a mug begins to hang: square on the peg, with its opening to one side, then to the other.
 
-    The peg is under the outermost place of the handle, so that the handle is on top and the mug's axis is level.
+    The handle is on top and the mug's axis level. It begins as close to the pole as other pegs and poles let it. There is
+    none for a side on which they do not, and none if the mug would hang down to the table.
+
+    Args:
+        mug: Its dimensions.
+        things: Its parts.
+        peg: Where it hangs.
+        rack: The rack of the peg.
+        racks: All of them.
     """
     sine, cosine = float(np.hypot(*peg.way[:2])), float(peg.way[2])
     level = np.array([*peg.way[:2], 0.0]) / sine
@@ -233,17 +257,29 @@ def _hanging(mug: Mug, peg: Peg, pole_radius: float) -> list[Array]:
     inner = _inner_reach(mug)
     # In the upright plane of the peg the mug is a disc below it, and the handle a plate across it.
     below = mug.radius + inner - peg.radius - HOVER
-    along = max(
-        (pole_radius + MARGIN + mug.radius - cosine * below) / sine,
-        (pole_radius + MARGIN + cosine * (peg.radius + mug.thickness)) / sine + mug.width / 2,
+    beside = rack.pole.size[0] / 2 + MARGIN
+    nearest = max(
+        (beside + mug.radius - cosine * below) / sine,
+        (beside + cosine * (peg.radius + mug.thickness)) / sine + mug.width / 2,
     )
-    touching = peg.root + along * peg.way
-    lowest = touching[2] - inner - 2 * mug.radius - mug.height / 4
-    if along + mug.width / 2 > peg.length or lowest < MARGIN:
-        return []
-    centre = touching - below * over
-    aside = np.cross(peg.way, over)
-    return [pose(np.stack([over, np.cross(z, over), z], axis=1), centre) for z in (aside, -aside)]
+    others = [*(other.pole for other in racks), *(p.part for other in racks for p in other.pegs if p is not peg)]
+    for aside in (np.cross(peg.way, over), np.cross(over, peg.way)):
+        rotation = np.stack([over, np.cross(aside, over), aside], axis=1)
+        for along in np.arange(nearest, peg.length - mug.width / 2, STEP):
+            touching = peg.root + along * peg.way
+            T_row_mug = pose(rotation, touching - below * over)
+            if touching[2] - inner - 2 * mug.radius - mug.height / 4 > MARGIN and _is_free(things, T_row_mug, others):
+                yield T_row_mug
+                break
+
+
+def _is_free(things: Sequence[Part], T_row_mug: Array, rods: Sequence[Part]) -> bool:
+    """Whether a mug keeps MARGIN from long cylinders, by points on their axes."""
+    share = np.linspace(-0.5, 0.5, 40)[:, None] * [0, 0, 1.0]
+    axes = np.concatenate([transform(rod.T, share * rod.size[2]) for rod in rods])
+    radius = np.repeat([rod.size[0] / 2 for rod in rods], len(share))
+    distance = solids.signed_distance(transform(inverse(T_row_mug), axes), *solids.collect(things)[:3])
+    return bool((distance - radius).min() > MARGIN / 2)
 
 
 def _inner_reach(mug: Mug) -> float:

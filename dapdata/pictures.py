@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 
 from dapdata import errors, records
 from dapdata.draw import POINT_RADIUS, Camera, Canvas, blank, draw_ground, draw_solids, frame, image, lit, paint, splat
+from dapdata.matching import hull_points
+from dapdata.poses import facing, transform
 
 Array = NDArray[Any]
 Sample = Mapping[str, Array]
@@ -52,12 +54,14 @@ class Shown:
 
 
 def front_view(sample: Sample, width: int, height: int) -> Camera:
-    """The camera in front of the container's opening, a little aside and above, with the container in the picture."""
-    T_world_container = sample["pose/T_world_container"]
-    out = T_world_container[:3, :3] @ sample["scene/opening"]
-    out = np.array([out[0], out[1], 0.0])
+    """The camera in front of the container, a little aside and above, with the container and its goals in the picture."""
+    out = facing(sample["pose/T_world_container"], sample["scene/opening"])
     aside = np.array([out[1], -out[0], 0.0])  # to the viewer's left of the opening's direction
-    return frame(sample["container/points"].astype(float), out - SIDE * aside + [0, 0, ABOVE], width, height)
+    corners = hull_points(*(sample[f"object_parts/{name}"] for name in ("kind", "size", "T_object_part")))
+    placed = [transform(T_world_object, corners) for T_world_object in sample["goals/T_world_object"]]
+    return frame(
+        np.concatenate([sample["container/points"], *placed]).astype(float), out - SIDE * aside + [0, 0, ABOVE], width, height
+    )
 
 
 def draw_scene(canvas: Canvas, sample: Sample) -> None:

@@ -241,7 +241,7 @@ def _row(demo: int, sample: store.Sample, is_shard: bool) -> dict[str, Any]:
 
 def describe(sample: store.Sample) -> dict[str, int]:
     """Seed, instances and counts of one demo."""
-    meta = {name: int(sample[f"meta/{name}"]) for name in ("seed", "container_instance", "object_instance", "attempts")}
+    meta = {name: int(sample[f"meta/{name}"]) for name in ("seed", "container_instance", "object_instance", "attempts", "task")}
     counts = {name: len(sample[path]) for name, path in COUNTED.items()}
     return meta | counts | {"positives": int((sample["container_superpoints/affordance"] > 0).sum())}
 
@@ -330,8 +330,9 @@ def _gather(
 
 def _index_row(recipe: Mapping[str, Any], shard: str, number: int, row: Mapping[str, Any]) -> dict[str, Any]:
     """A row of the index, but for the split."""
-    place = {"shard": shard, "row": number, "task": recipe["scene"]["task"]}
-    return {"demo": row["demo"], **place, **{k: v for k, v in row.items() if k != "demo"}}
+    names = [scene["task"] for scene in recipe["scene"].get("scenes", [recipe["scene"]])]
+    place = {"shard": shard, "row": number, "task": names[row["task"]]}
+    return {"demo": row["demo"], **place, **{k: v for k, v in row.items() if k not in ("demo", "task")}}
 
 
 def _index(folder: Path, config: SplitConfig, seed: int) -> Index | None:

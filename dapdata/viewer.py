@@ -33,6 +33,7 @@ from dapdata.pictures import (
     superpoint_colors,
     title,
 )
+from dapdata.poses import facing
 
 Array = NDArray[Any]
 
@@ -102,7 +103,7 @@ def _demo_data(shown: Shown) -> dict[str, Any]:
     sample = shown.sample
     points = sample["container/points"]
     low, high = points.min(axis=0), points.max(axis=0)
-    out = sample["pose/T_world_container"][:3, :3] @ sample["scene/opening"]
+    out = facing(sample["pose/T_world_container"], sample["scene/opening"])
     name, counts = title(shown)
     T_world_container = sample["pose/T_world_container"]
     return {

@@ -147,8 +147,8 @@ def _key_table(root: Any, paths: Any, skip: int) -> str:
 
 
 def _default(root: Any, path: Any) -> Any:
-    """The default of a key: that of the outermost section which states one."""
-    for n in range(1, len(path) + 1):
+    """The default of a key: its own, or that of the innermost section which states one."""
+    for n in range(len(path), 0, -1):
         value = keys.at(root, path[:n]).get("default")
         if value is not None:
             for part in path[n:]:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from dapdata import loading, metrics, predictions
 from dapdata import rng as rngs
-from dapdata.config import EvalConfig
+from dapdata.config import EvalConfig, TrainConfig
 from dapdata.console import seldom
 from dapdata.errors import FormatError, UsageError
 from dapdata.loading import Dataset
@@ -100,6 +100,7 @@ def evaluate(
     predictor = _load(run, method, device, changes or {})
     dataset = loading.open(data if data is not None else data_of(run), split)
     config = EvalConfig.model_validate(dataset.recipe.get("eval", {}))
+    usual = TrainConfig.model_validate(dataset.recipe.get("train", {}))
     trials, k, protocol = trials or config.trials, k or config.k, protocol or config.protocol
     if draws is not None and draws < k:
         raise UsageError(f"draws: got {draws}, expected at least k ({k}): what is judged was drawn; give more, or a smaller k")
@@ -114,8 +115,11 @@ def evaluate(
     samples = [dataset[i] for i in range(min(trials, len(dataset)))]
     seed = int(dataset.recipe["seed"])
 
-    others = {name: _guess(name, samples, draws, seed, say) for name in baselines.NAMES} if references else {}
-    mine = _predict(predictor, samples, k, draws, seed, say) if predictor else _guess(method, samples, draws, seed, say)
+    def guess(name: str) -> Proposals:
+        return _guess(baselines.load(name, usual), name, samples, draws, seed, say)
+
+    others = {name: guess(name) for name in baselines.NAMES} if references else {}
+    mine = _predict(predictor, samples, k, draws, seed, say) if predictor else guess(method)
     path = predictions.write(folder / "predictions.npz", predictions.collect(mine.placements, k))
     report, results = metrics.judge_dataset(
         predictions.read(path),
@@ -145,9 +149,9 @@ def evaluate(
 # Predicting ------------------------------------------------------------------------------------------------
 
 
-def _guess(name: str, samples: Sequence[Sample], draws: int, seed: int, say: Say) -> Proposals:
+def _guess(place: baselines.Method, name: str, samples: Sequence[Sample], draws: int, seed: int, say: Say) -> Proposals:
     """The placements of a baseline, in the order drawn."""
-    place, found = baselines.load(name), Proposals()
+    found = Proposals()
     for i, sample in enumerate(samples):
         demo = int(sample["meta/demo"])
         start = time.perf_counter()

@@ -16,7 +16,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dapdata import errors, records
-from dapdata.draw import POINT_RADIUS, Camera, Canvas, blank, draw_ground, draw_solids, frame, image, lit, paint, splat
+from dapdata.draw import (
+    POINT_RADIUS,
+    Camera,
+    Canvas,
+    blank,
+    draw_ground,
+    draw_solids,
+    frame,
+    image,
+    lit,
+    paint,
+    splat,
+    triangulate,
+)
 
 Array = NDArray[Any]
 Sample = Mapping[str, Array]
@@ -64,7 +77,7 @@ def draw_scene(canvas: Canvas, sample: Sample) -> None:
     """Adds the true parts of the container and of the clutter, and the table."""
     color = np.where(sample["scene/role"][:, None] == records.ROLES.index("container"), [WOOD], [CLUTTER])
     T_world_part = sample["pose/T_world_container"] @ sample["scene/T_container_part"]
-    draw_solids(canvas, sample["scene/kind"], sample["scene/size"], T_world_part, color)
+    draw_solids(canvas, triangulate(sample["scene/kind"], sample["scene/size"], T_world_part), color)
     draw_ground(canvas, sample["pose/T_world_container"][:3, 3], radius=0.6)
 
 
@@ -72,11 +85,8 @@ def draw_goals(
     canvas: Canvas, sample: Sample, T_world_object: Array, color: tuple[float, float, float], opacity: float, hidden: float
 ) -> None:
     """Adds the object's solids at (G, 4, 4) poses; `opacity` and `hidden` as in `draw_solids`."""
-    if not len(T_world_object):
-        return
-    T_world_part = (T_world_object[:, None] @ sample["object_parts/T_object_part"][None]).reshape(-1, 4, 4)
-    kind, size = (np.concatenate([sample[f"object_parts/{name}"]] * len(T_world_object)) for name in ("kind", "size"))
-    draw_solids(canvas, kind, size, T_world_part, color, opacity, hidden)
+    solid = triangulate(*(sample[f"object_parts/{name}"] for name in ("kind", "size", "T_object_part")))
+    draw_solids(canvas, solid.at(T_world_object), color, opacity, hidden)
 
 
 def is_demonstrated(sample: Sample) -> Array:

@@ -213,15 +213,16 @@ class Triangles:
         return Triangles(vertices.reshape(-1, 3), faces.reshape(-1, 3), (self.part + step * parts).ravel())
 
 
-def triangulate(kind: Array, size: Array, T: Array) -> Triangles:
+def triangulate(kind: Array, size: Array, T: Array, *, sections: int = 64) -> Triangles:
     """The triangles of P parts: the one place where pictures and 3-D views learn what a part looks like.
 
     Args:
         kind: (P,) index into records.PART_KINDS.
         size: (P, 3) full extents, m.
         T: (P, 4, 4) in the frame that the triangles shall be in.
+        sections: Sides of a cylinder.
     """
-    meshes = [to_trimesh(kind[p : p + 1], size[p : p + 1], T[p : p + 1]) for p in range(len(kind))]
+    meshes = [to_trimesh(kind[p : p + 1], size[p : p + 1], T[p : p + 1], sections) for p in range(len(kind))]
     first = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
     return Triangles(
         np.concatenate([np.zeros((0, 3)), *(mesh.vertices for mesh in meshes)]),

@@ -39,6 +39,7 @@ INSET = 150  # px, of the two small pictures of the object
 GUTTER, ROW_TITLE, HEADER, FOOTER = 14, 40, 74, 118  # px
 BAR = PANEL[0] - 180  # px, length of a bar of colours
 DPI = 100
+JPEG = 82  # quality of pictures in pages
 SIDE, ABOVE = 0.42, 0.36  # the viewer stands this far aside and above, per unit in front of the opening
 WOOD, CLUTTER = (0.93, 0.90, 0.85), (0.70, 0.73, 0.79)
 VALID, DEMONSTRATED = (0.00, 0.62, 0.45), (0.96, 0.64, 0.00)
@@ -142,12 +143,13 @@ def panels(sample: Sample, top: float, size: tuple[int, int] = PANEL, inset: int
     return pictures | {"goals": goal_picture(sample, camera)} | _object_pictures(sample, inset)
 
 
-def png(pixels: Array) -> bytes:
-    """A picture as the bytes of a PNG file; the same bytes for the same picture."""
+def file(pixels: Array, kind: str = "png") -> bytes:
+    """A picture as the bytes of a PNG or JPEG file; the same bytes for the same picture."""
     from matplotlib import image as files
 
     buffer = io.BytesIO()
-    files.imsave(buffer, pixels, format="png", metadata={"Software": "dapdata"})
+    options = {"metadata": {"Software": "dapdata"}} if kind == "png" else {"pil_kwargs": {"quality": JPEG}}
+    files.imsave(buffer, pixels, format=kind, **options)
     return buffer.getvalue()
 
 
@@ -202,8 +204,8 @@ def _listed(codes: Array, names: tuple[str, ...]) -> str:
     return f"{len(codes)}" + (f" ({', '.join(f'{n} {name}' for name, n in counts.most_common())})" if counts else "")
 
 
-def sheet(shown: Sequence[Shown], heading: str) -> bytes:
-    """A contact sheet as the bytes of a PNG: one row per demo, columns and legends named."""
+def sheet(shown: Sequence[Shown], heading: str, kind: str = "png") -> bytes:
+    """A contact sheet as the bytes of a PNG or, kind "jpeg", a JPEG: one row per demo, columns and legends named."""
     tops = max(float(s.sample["container/points"][:, 2].max()) for s in shown)
     columns = [(INSET, "object"), *((PANEL[0], name) for name in ("cloud", "superpoints", "affordance", "goals"))]
     width = sum(w + GUTTER for w, _ in columns) + GUTTER
@@ -222,7 +224,7 @@ def sheet(shown: Sequence[Shown], heading: str) -> bytes:
         place.line(GUTTER, width - GUTTER, y + 3)
         _draw_row(place, panels(item.sample, tops), columns, y + ROW_TITLE)
     _legends(place, shown, tops, height - FOOTER, width)
-    return place.png()
+    return place.file(kind)
 
 
 COLUMN_TITLES = {
@@ -267,10 +269,11 @@ class Place:
             self.text(x + share * length, y + 24, label, size=9, color="#333", ha=align)
         self.text(x + length / 2, y - 10, name, size=10, color="#333", ha="center")
 
-    def png(self) -> bytes:
-        """The figure as the bytes of a PNG file; the same bytes for the same things on it."""
+    def file(self, kind: str = "png") -> bytes:
+        """The figure as the bytes of a PNG or JPEG file; the same bytes for the same things on it."""
         buffer = io.BytesIO()
-        self.figure.savefig(buffer, format="png", metadata={"Software": "dapdata"})
+        options = {"metadata": {"Software": "dapdata"}} if kind == "png" else {"pil_kwargs": {"quality": JPEG}}
+        self.figure.savefig(buffer, format=kind, **options)
         return buffer.getvalue()
 
 

@@ -27,8 +27,8 @@ LINES = (
     ("recipe", "store", "stages", "engines", "manifest", "card", "report", "predictions"),
     ("plan", "units"),
     ("pipeline",),
-    ("loading", "draw", "schemas"),
-    ("metrics", "health", "pictures"),
+    ("loading", "draw", "schemas", "plots"),
+    ("metrics", "health", "pictures", "page"),
     ("viewer",),
     ("show", "bench"),
     ("cli",),
@@ -55,6 +55,7 @@ DOORS = {
     "pebble": {"engines"},
     "torch": {"loading", "daptrain"},
     "yaml": {"strict_yaml"},
+    "plotly": {"plots"},
 }
 HEAVY = ("pybullet", "numba", "open3d", "trimesh", "torch", "scipy", "matplotlib", "zarr", "pyarrow", "pandas", "rich")
 QUATERNION_WORDS = ("quat", "getEulerFromQuaternion", "as_quat")

@@ -130,7 +130,7 @@ def strip(sample: Sample, frames: Sequence[Sequence[Array]], left: Sequence[int]
         "places."
     )
     place.text(columns[1] + GUTTER, y + 6, caption, size=11, color="#555", linespacing=1.5)
-    return place.png()
+    return place.file()
 
 
 def fitting_view(sample: Sample, points: Array) -> Camera:

@@ -346,13 +346,13 @@ def _blend(canvas: Canvas, color: Array, depth: Array, line: Array, opacity: flo
 
 def image(canvas: Canvas) -> Array:
     """(height, width, 3) uint8: the finished picture, shaded by depth and averaged down."""
-    shaded = canvas.color * _depth_shade(canvas.depth)[..., None]
+    shaded = canvas.color * depth_shade(canvas.depth)[..., None]
     steps = range(OVERSAMPLE)
     small = sum(shaded[i::OVERSAMPLE, j::OVERSAMPLE] for i in steps for j in steps) / OVERSAMPLE**2
     return np.asarray(np.round(np.clip(small, 0, 1) * 255), np.uint8)
 
 
-def _depth_shade(depth: Array) -> Array:
+def depth_shade(depth: Array) -> Array:
     """(H, W) in (0, 1]: darker the further a pixel lies behind its neighbours (at two distances)."""
     finite = np.isfinite(depth)
     log = np.log(np.where(finite, depth, 1e3)).astype(np.float32)

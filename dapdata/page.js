@@ -2,6 +2,7 @@
 // What all pages do: unpack the plotting library, draw plots in the colours of the theme, fill and sort tables.
 
 const bytes = text => Uint8Array.from(atob(text), c => c.charCodeAt(0));
+const unpacked = text => new Response(new Blob([bytes(text)]).stream().pipeThrough(new DecompressionStream("gzip")));
 const element = (name, properties = {}, ...children) => {
   const made = Object.assign(document.createElement(name), properties);
   made.append(...children);
@@ -38,9 +39,7 @@ function plot(box) {
 }
 async function library() {
   const packed = document.getElementById("library");
-  if (!packed) return;
-  const stream = new Blob([bytes(packed.textContent)]).stream().pipeThrough(new DecompressionStream("gzip"));
-  document.head.append(element("script", { textContent: await new Response(stream).text() }));
+  document.head.append(element("script", { textContent: await unpacked(packed.textContent).text() }));
   packed.remove();
 }
 

@@ -8,6 +8,7 @@ page as JSON and shown as text.
 from __future__ import annotations
 
 import base64
+import gzip
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -31,23 +32,19 @@ class Section:
     html: str
 
 
-def document(title: str, lead: str, sections: Iterable[Section | None], scripts: Sequence[Path] = ()) -> str:
+def document(title: str, lead: str, sections: Iterable[Section | None]) -> str:
     """The whole page.
 
     Args:
         title: Text.
         lead: HTML before the first section: what the page is about, and its facts.
         sections: In order; None are left out.
-        scripts: Further JavaScript files that the page needs, after its own.
     """
     shown = [(f"s{i}", section) for i, section in enumerate(section for section in sections if section is not None)]
-    style = _beside("page.css")
+    style = Path(__file__).with_name("page.css").read_text("utf-8")
     links = "".join(f'<a href="#{key}">{escape(section.heading)}</a>' for key, section in shown)
     body = "\n".join(
         f'<section id="{key}"><h2>{escape(section.heading)}</h2>\n{section.html}</section>' for key, section in shown
-    )
-    code = "\n".join(
-        f"<script>\n{text}</script>" for text in [_beside("page.js"), *(path.read_text("utf-8") for path in scripts)]
     )
     return f"""<!doctype html>
 <html lang="en">
@@ -67,14 +64,15 @@ def document(title: str, lead: str, sections: Iterable[Section | None], scripts:
 {body}
 </main>
 <script type="text/plain" id="library">{plots.library()}</script>
-{code}
+{script(Path(__file__).with_name("page.js"))}
 </body>
 </html>
 """
 
 
-def _beside(name: str) -> str:
-    return Path(__file__).with_name(name).read_text(encoding="utf-8")
+def script(path: Path) -> str:
+    """A JavaScript file as a script element. It may wait for the event "plotting" and use what `page.js` defines."""
+    return f"<script>\n{path.read_text('utf-8')}</script>"
 
 
 def data(value: Any, key: str | None = None) -> str:
@@ -91,6 +89,12 @@ def pack(values: Array, dtype: str) -> str:
     """The bytes of an array, rounded to a small little-endian type such as "<u2", as base64."""
     rounded = np.round(values) if np.dtype(dtype).kind in "iu" else values
     return base64.b64encode(np.ascontiguousarray(rounded, dtype=dtype).tobytes()).decode()
+
+
+def squeeze(values: Array, dtype: str) -> str:
+    """As `pack`, compressed: for pictures and the like, in which neighbours are equal."""
+    rounded = np.ascontiguousarray(np.round(values), dtype=dtype)
+    return base64.b64encode(gzip.compress(rounded.tobytes(), mtime=0)).decode()
 
 
 def paragraph(text: str, kind: str = "") -> str:

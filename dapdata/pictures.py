@@ -20,6 +20,7 @@ from dapdata.draw import (
     POINT_RADIUS,
     Camera,
     Canvas,
+    Triangles,
     blank,
     draw_ground,
     draw_solids,
@@ -76,18 +77,31 @@ def front_view(sample: Sample, width: int, height: int) -> Camera:
 
 def draw_scene(canvas: Canvas, sample: Sample) -> None:
     """Adds the true parts of the container and of the clutter, and the table."""
-    color = np.where(sample["scene/role"][:, None] == records.ROLES.index("container"), [WOOD], [CLUTTER])
-    T_world_part = sample["pose/T_world_container"] @ sample["scene/T_container_part"]
-    draw_solids(canvas, triangulate(sample["scene/kind"], sample["scene/size"], T_world_part), color)
+    parts = solids(sample)
+    for role, color in zip(records.ROLES, (WOOD, CLUTTER)):
+        draw_solids(canvas, parts[role].at(sample["pose/T_world_container"][None]), color)
     draw_ground(canvas, sample["pose/T_world_container"][:3, 3], radius=0.6)
+
+
+def solids(sample: Sample, sections: int = 64) -> dict[str, Triangles]:
+    """The true solids of a demo: the object in its own frame, container and clutter in the container's.
+
+    Args:
+        sample: One demo's arrays by shard path.
+        sections: Sides of a cylinder.
+    """
+    scene = [sample[f"scene/{name}"] for name in ("kind", "size", "T_container_part")]
+    object_ = [sample[f"object_parts/{name}"] for name in ("kind", "size", "T_object_part")]
+    of_role = {role: sample["scene/role"] == code for code, role in enumerate(records.ROLES)}
+    found = {role: triangulate(*(array[mine] for array in scene), sections=sections) for role, mine in of_role.items()}
+    return found | {"object": triangulate(*object_, sections=sections)}
 
 
 def draw_goals(
     canvas: Canvas, sample: Sample, T_world_object: Array, color: tuple[float, float, float], opacity: float, hidden: float
 ) -> None:
     """Adds the object's solids at (G, 4, 4) poses; `opacity` and `hidden` as in `draw_solids`."""
-    solid = triangulate(*(sample[f"object_parts/{name}"] for name in ("kind", "size", "T_object_part")))
-    draw_solids(canvas, solid.at(T_world_object), color, opacity, hidden)
+    draw_solids(canvas, solids(sample)["object"].at(T_world_object), color, opacity, hidden)
 
 
 def is_demonstrated(sample: Sample) -> Array:

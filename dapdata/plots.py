@@ -17,7 +17,9 @@ import gzip
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
+from html import escape
 from itertools import pairwise
+from textwrap import wrap
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -121,6 +123,11 @@ def histogram(values: Array, height: int = 150) -> Figure:
 DASHED = {"color": "var(--ink)", "width": 1, "dash": "dot"}
 
 
+def text(name: str) -> str:
+    """A name as plotly's text, which would take tags in it for its own."""
+    return escape(name.replace("_", " "), quote=False)
+
+
 def number(value: float | None) -> str:
     """A value with thousands separated and no more decimals than tell it apart; a dash for None."""
     if value is None:
@@ -144,8 +151,8 @@ def bars(counts: Mapping[str, int], *more: tuple[str, Mapping[str, int]], name: 
             {
                 "type": "bar",
                 "orientation": "h",
-                "name": label,
-                "y": [key.replace("_", " ") for key in names],
+                "name": text(label),
+                "y": [text(key) for key in names],
                 "x": [row.get(key, 0) for key in names],
                 "text": [f"{row.get(key, 0):,}" for key in names],
                 "textposition": "outside",
@@ -165,7 +172,7 @@ def bars(counts: Mapping[str, int], *more: tuple[str, Mapping[str, int]], name: 
 def rates(series: Mapping[str, Mapping[str, Interval]], height: int | None = None) -> Figure:
     """Rates with their 95 % intervals, in percent: a row a name, in it a dot a series."""
     names = list(next(iter(series.values())))
-    spread = np.linspace(-0.3, 0.3, len(series)) if len(series) > 1 else np.zeros(1)
+    spread = 0.18 * (np.arange(len(series)) - (len(series) - 1) / 2)
     rows = np.arange(len(names))
     return figure(
         height or 70 + (16 + 14 * len(series)) * len(names),
@@ -173,12 +180,12 @@ def rates(series: Mapping[str, Mapping[str, Interval]], height: int | None = Non
             {
                 "type": "scatter",
                 "mode": "markers",
-                "name": method,
+                "name": text(method),
                 "y": rows + offset,
                 "x": [100 * rate.value for rate in found.values()],
                 "error_x": {"type": "data", "thickness": 1.6, "width": 4, **_errors(list(found.values()))},
                 "marker": {"size": 9, "color": COLORS[i % len(COLORS)]},
-                "customdata": [[name, says(rate)] for name, rate in found.items()],
+                "customdata": [[text(name), says(rate)] for name, rate in found.items()],
                 "hovertemplate": "%{customdata[0]}: %{customdata[1]}",
             }
             for i, ((method, found), offset) in enumerate(zip(series.items(), spread))
@@ -186,7 +193,7 @@ def rates(series: Mapping[str, Mapping[str, Interval]], height: int | None = Non
         xaxis={"range": [-2, 102], "dtick": 20, "ticksuffix": " %"},
         yaxis={
             "tickvals": rows,
-            "ticktext": names,
+            "ticktext": ["<br>".join(map(text, wrap(name, 22))) for name in names],
             "range": [len(names) - 0.45, -0.55],
             "showgrid": False,
             "zeroline": False,
@@ -220,8 +227,16 @@ class Line:
     dashed: bool = False
 
 
-def lines(drawn: Sequence[Line], x: str, y: str = "", *, log: bool = False, height: int = 300, **layout: Any) -> Figure:
-    """Lines over x, of rates in percent with bands; `x` and `y` name the axes. log: x in powers of two, ticks at its values."""
+def lines(drawn: Sequence[Line], x: str, *, log: bool = False, percent: bool = False, height: int = 300) -> Figure:
+    """Lines over x, whose name is given, of rates in percent with bands, or of numbers.
+
+    Args:
+        drawn: The lines.
+        x: What the axis counts.
+        log: Whether x is logarithmic, with a tick at each value.
+        percent: Whether numbers are percentages, as rates always are.
+        height: px.
+    """
     traces: list[dict[str, Any]] = []
     for line in drawn:
         intervals = [value for value in line.y if isinstance(value, Interval)]
@@ -231,7 +246,7 @@ def lines(drawn: Sequence[Line], x: str, y: str = "", *, log: bool = False, heig
             traces.append({"x": [*line.x, *line.x[::-1]], "y": ends, "showlegend": False, "mode": "lines", **band})
         traces.append(
             {
-                "name": line.name,
+                "name": text(line.name),
                 "x": list(line.x),
                 "y": [100 * value.value if isinstance(value, Interval) else value for value in line.y],
                 "mode": "lines+markers" if len(line.x) <= 40 else "lines",
@@ -243,7 +258,7 @@ def lines(drawn: Sequence[Line], x: str, y: str = "", *, log: bool = False, heig
         )
     ticks = sorted({value for line in drawn for value in line.x})
     axis = {"type": "log", "tickvals": ticks, "ticktext": [f"{tick:,}" for tick in ticks]} if log else {"nticks": 7}
-    percent = {"range": [-2, 102], "ticksuffix": " %"} if any(isinstance(v, Interval) for line in drawn for v in line.y) else {}
+    percent = percent or any(isinstance(value, Interval) for line in drawn for value in line.y)
+    rising = {"rangemode": "tozero", "ticksuffix": " %"} if percent else {}
     made = figure(height, *({"type": "scatter", **trace} for trace in traces), showlegend=len(drawn) > 1)
-    made.update_layout(xaxis={"title": {"text": x}, "zeroline": False, **axis}, yaxis={"title": {"text": y}, **percent})
-    return made.update_layout(**layout)
+    return made.update_layout(xaxis={"title": {"text": x}, "zeroline": False, **axis}, yaxis=rising)

@@ -96,6 +96,17 @@ def show_html(dataset: Path, out: Path | None = None, demos: Sequence[int] | Non
     return _write(out or Path(f"{found.manifest.name}.html"), dataset_page(found, shown).encode())
 
 
+def show_rerun(dataset: Path, out: Path | None = None, demos: Sequence[int] | None = None, count: int = 4) -> Path | None:
+    """Shows demos of a dataset in the rerun viewer, or writes them to `out`, an .rrd file, and returns its path.
+
+    Arguments as in `contact_sheet`; raises as `live.stream` does.
+    """
+    from dapdata import live
+
+    live.stream(choose(Path(dataset), demos, count), manifest.read(Path(dataset)).name, out)
+    return out
+
+
 def _write(out: Path, content: bytes) -> Path:
     out.parent.mkdir(parents=True, exist_ok=True)
     out.write_bytes(content)
@@ -120,7 +131,6 @@ def dataset_page(found: Dataset, shown: Sequence[Shown]) -> str:
             Section("Contact sheet", page.picture(sheet(shown, about.name, "jpeg"), "a row a demo", "sheet")),
             Section("Where it comes from", _origin(found)),
         ],
-        scripts=[viewer.SCRIPT],
     )
 
 

@@ -1,6 +1,6 @@
 // The 3-D view: layers of a demo -> traces of plotly. See viewer.py for what a view holds.
 document.addEventListener("plotting", () => {
-  const { views, colours } = content("views"), $ = id => document.getElementById(id), stage = $("stage");
+  const { views, colours, colour: first } = content("views"), $ = id => document.getElementById(id), stage = $("stage");
   const DISTANCE = 1.2; // of the eye from the middle of the view, which the container spans with about 1.1
   const switched = {}; // layer name -> shown, once somebody has clicked it
   let view = null, eye = null;
@@ -55,7 +55,7 @@ document.addEventListener("plotting", () => {
   };
   const coloured = layer => {
     const values = view.clouds[layer.cloud].values[colour()];
-    if (!values) return { color: "#9aa3ad" };
+    if (!values) return { color: colours.find(c => c.name === "plain").scale[0][1] };
     const small = bytes(values), intensity = new Float32Array(6 * small.length);
     for (let v = 0; v < intensity.length; v++) intensity[v] = small[Math.floor(v / 6)] / 255;
     return { intensity, colorscale: colours.find(c => c.name === colour()).scale, cmin: 0, cmax: 1, showscale: false };
@@ -115,7 +115,7 @@ document.addEventListener("plotting", () => {
     $("scale").style.background = name === "superpoint" ? "none" : `linear-gradient(90deg, ${scale.map(([, c]) => c).join(", ")})`;
     $("ends").replaceChildren(...[ends[0], name === "height" ? view.top : ends[1]].map(text => element("span", { textContent: text })));
   }
-  $("colours").append(...colours.map(({ name, title }, i) => element("label", {}, element("input", { type: "radio", name: "colour", value: name, checked: !i }), title)),
+  $("colours").append(...colours.map(({ name, title }) => element("label", {}, element("input", { type: "radio", name: "colour", value: name, checked: name === first }), title)),
     element("div", { id: "scale", className: "scale" }), element("div", { id: "ends", className: "ends" }));
   $("colours").addEventListener("change", () => { legend(); draw(); });
   $("demo").addEventListener("change", () => show(views[$("demo").selectedIndex]));

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dapdata import page, records
-from dapdata.draw import POINT_RADIUS, Triangles, to_light, triangulate
+from dapdata.draw import POINT_RADIUS, Triangles, to_light
 from dapdata.pictures import (
     CLUTTER,
     DEMONSTRATED,
@@ -30,6 +30,7 @@ from dapdata.pictures import (
     front_view,
     height_colors,
     is_demonstrated,
+    solids,
     superpoint_colors,
     title,
 )
@@ -38,17 +39,18 @@ from dapdata.poses import inverse, transform
 Array = NDArray[Any]
 Layer = dict[str, Any]
 
-SCRIPT = Path(__file__).with_name("viewer.js")
-MAX_POINTS = 40_000  # of a cloud; more are thinned out evenly
+MAX_POINTS = 40_000  # of a cloud
 FRUSTUM = 0.06  # m, length of a camera as drawn
 STEPS = 256  # of a scale of colours
 SECTIONS = 32  # sides of a cylinder
+GOALS = {"demonstrated goal": (DEMONSTRATED, 0.7), "other valid goals": (VALID, 0.6)}
+PLAIN = np.full((2, 3), 0.74)
 CAMERA = (0.45, 0.45, 0.75)
 CORRESPONDENCE = (0.55, 0.35, 0.75)
 
 
-def widget(views: Sequence[Mapping[str, Any]]) -> str:
-    """The HTML of a 3-D view with a choice of demos, each from `view`; its page needs `SCRIPT`."""
+def widget(views: Sequence[Mapping[str, Any]], colour: str = "height") -> str:
+    """The HTML of a 3-D view with a choice of demos, each from `view`; `colour` is that of the points at first."""
     options = "".join(f'<option value="{v["demo"]}">{escape(v["name"])}</option>' for v in views)
     return f"""<div class="view">
 <div class="stage"><div id="stage"></div><div class="buttons">
@@ -61,7 +63,8 @@ def widget(views: Sequence[Mapping[str, Any]]) -> str:
 <fieldset id="colours"><legend>Colour of the points</legend></fieldset>
 <fieldset id="layers"><legend>Shown</legend></fieldset>
 </form></div>
-{page.data({"views": views, "colours": list(_colours())}, "views")}"""
+{page.data({"views": views, "colours": list(_colours()), "colour": colour}, "views")}
+{page.script(Path(__file__).with_name("viewer.js"))}"""
 
 
 def _colours() -> Iterator[dict[str, Any]]:
@@ -74,16 +77,25 @@ def _colours() -> Iterator[dict[str, Any]]:
     yield described("height", "height (raw cloud)", height_colors(np.linspace(0, 1, 9), 1), ("0 m", ""))
     yield described("superpoint", "superpoint", superpoint_colors(STEPS), ("a colour each", ""))
     yield described("affordance", "affordance", DIVERGING, ("−1 keep away", "place here +1"))
+    yield described("plain", "plain", PLAIN, ("", ""))
     yield described("camera", "camera that saw it", superpoint_colors(STEPS)[:12], ("a colour each", ""))
 
 
-def view(shown: Shown, *more: Layer, note: str = "") -> dict[str, Any]:
+def view(
+    shown: Shown,
+    *more: Layer,
+    note: str = "",
+    goals: Mapping[str, tuple[Sequence[float], float]] = GOALS,
+    most: int = MAX_POINTS,
+) -> dict[str, Any]:
     """One demo for `widget`, ready for JSON.
 
     Args:
         shown: The demo.
-        more: Further layers, such as `poses_layer(...)`: they come first.
+        more: Further layers, such as `poses_layer(...)`.
         note: Text about the demo; default: its counts.
+        goals: Name, colour and opacity of the demonstrated goal and of the other ones; of all, if it is one.
+        most: Points of a cloud that are kept; of more, so many are kept that are spread evenly.
     """
     sample = shown.sample
     name, counts = title(shown)
@@ -100,25 +112,26 @@ def view(shown: Shown, *more: Layer, note: str = "") -> dict[str, Any]:
         "reach": float(np.abs(_everywhere(sample) - (low + high) / 2).max()) + 0.1,
         "eye": (-front.T_world_camera[:3, 2]).tolist(),
         "light": to_light(front).tolist(),
-        "clouds": {body: _cloud(sample, body, float(high[2])) for body in ("container", "object")},
-        "solids": {name: _solid(triangles) for name, triangles in _solids(sample).items()},
-        "layers": [*more, *layers(sample)],
+        "clouds": {body: _cloud(sample, body, float(high[2]), most) for body in ("container", "object")},
+        "solids": {name: _solid(triangles) for name, triangles in solids(sample, SECTIONS).items()},
+        "layers": [*more, *layers(sample, goals)],
     }
 
 
-def layers(sample: Sample) -> Iterator[Layer]:
+def layers(sample: Sample, goals: Mapping[str, tuple[Sequence[float], float]] = GOALS) -> Iterator[Layer]:
     """What a demo has to show: its clouds, goals, rejected candidates, correspondences, true parts and cameras."""
     T_object_start = inverse(sample["pose/T_world_object_start"])
     yield {"kind": "cloud", "name": "container cloud", "cloud": "container", "on": True}
     yield {"kind": "cloud", "name": "object cloud, start pose", "cloud": "object", "on": True}
     moved = (sample["pose/T_world_object_goal"] @ T_object_start).ravel().tolist()
     yield {"kind": "cloud", "name": "object cloud, demonstrated", "cloud": "object", "on": False, "T": moved}
-    demonstrated = is_demonstrated(sample)
+    demonstrated = is_demonstrated(sample) if len(goals) == 2 else np.ones(len(sample["goals/kind"]), bool)
     kinds = [records.GOAL_KINDS[kind] for kind in sample["goals/kind"]]
     says = [f"goal {g}: {k}, {1000 * c:.0f} mm free play" for g, (k, c) in enumerate(zip(kinds, sample["goals/clearance"]))]
-    for name, color, mine in (("demonstrated goal", DEMONSTRATED, demonstrated), ("other valid goals", VALID, ~demonstrated)):
+    for (name, (color, opacity)), mine in zip(goals.items(), (demonstrated, ~demonstrated)):
         if mine.any():
-            yield poses_layer(name, color, sample["goals/T_world_object"][mine], [says[g] for g in np.flatnonzero(mine)])
+            T = sample["goals/T_world_object"][mine]
+            yield poses_layer(name, color, T, [says[g] for g in np.flatnonzero(mine)], opacity=opacity)
     for code, reason in enumerate(records.REJECT_REASONS):
         T = sample["rejected_goals/T_world_object"][sample["rejected_goals/reason"] == code]
         if len(T):
@@ -197,9 +210,9 @@ def _everywhere(sample: Sample) -> Array:
     return np.concatenate([sample["container/points"], sample["object/points"], *(T[:, :3, 3] for T in poses)]).astype(float)
 
 
-def _cloud(sample: Sample, body: str, top: float) -> dict[str, Any]:
+def _cloud(sample: Sample, body: str, top: float, most: int) -> dict[str, Any]:
     points = sample[f"{body}/points"].astype(float)
-    keep = np.unique(np.linspace(0, len(points) - 1, min(len(points), MAX_POINTS)).astype(int))
+    keep = np.unique(np.linspace(0, len(points) - 1, min(len(points), most)).astype(int))
     low = points.min(axis=0)
     step = np.maximum(np.ptp(points, axis=0), 1e-6) / 65535
     superpoint = sample[f"{body}/superpoint"][keep]
@@ -218,15 +231,6 @@ def _cloud(sample: Sample, body: str, top: float) -> dict[str, Any]:
         "values": {name: page.pack(value, "u1") for name, value in values.items()},
         "radius": POINT_RADIUS * (1.0 if body == "container" else 0.6),  # the object's cloud is finer
     }
-
-
-def _solids(sample: Sample) -> dict[str, Triangles]:
-    """The true solids: the object in its own frame, container and clutter in the container's."""
-    scene = [sample[f"scene/{name}"] for name in ("kind", "size", "T_container_part")]
-    object_ = [sample[f"object_parts/{name}"] for name in ("kind", "size", "T_object_part")]
-    of_role = {role: sample["scene/role"] == code for code, role in enumerate(records.ROLES)}
-    solids = {role: triangulate(*(array[mine] for array in scene), sections=SECTIONS) for role, mine in of_role.items()}
-    return solids | {"object": triangulate(*object_, sections=SECTIONS)}
 
 
 def _solid(triangles: Triangles) -> dict[str, str]:

@@ -29,7 +29,7 @@ LINES = (
     ("pipeline",),
     ("loading", "draw", "schemas", "plots"),
     ("metrics", "health", "pictures", "page"),
-    ("viewer",),
+    ("viewer", "live"),
     ("show", "bench"),
     ("cli",),
     ("__main__",),
@@ -42,7 +42,7 @@ MUST_NOT_KNOW = {
 }
 DAPTRAIN_MAY_KNOW = {
     "loading", "metrics", "records", "poses", "simulate", "errors", "rng", "config", "solids", "report", "predictions",
-    "pictures", "draw", "matching", "clouds",
+    "pictures", "draw", "page", "plots", "viewer", "matching", "clouds",
     "cluster",  # a user's own cloud must be partitioned as the training clouds were
 }  # fmt: skip
 DOORS = {
@@ -56,8 +56,23 @@ DOORS = {
     "torch": {"loading", "daptrain"},
     "yaml": {"strict_yaml"},
     "plotly": {"plots"},
+    "rerun": {"live"},
 }
-HEAVY = ("pybullet", "numba", "open3d", "trimesh", "torch", "scipy", "matplotlib", "zarr", "pyarrow", "pandas", "rich")
+HEAVY = (
+    "pybullet",
+    "numba",
+    "open3d",
+    "trimesh",
+    "torch",
+    "scipy",
+    "matplotlib",
+    "zarr",
+    "pyarrow",
+    "pandas",
+    "rich",
+    "plotly",
+    "rerun",
+)
 QUATERNION_WORDS = ("quat", "getEulerFromQuaternion", "as_quat")
 
 

@@ -169,9 +169,8 @@ def test_a_view_reaches_around_everything_that_it_can_show(sample: pictures.Samp
     assert np.abs(far - view["center"]).max() <= view["reach"]
 
 
-def test_long_clouds_are_thinned_evenly(sample: pictures.Sample, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(viewer, "MAX_POINTS", 100)
-    cloud = viewer.view(shown())["clouds"]["container"]
+def test_long_clouds_are_thinned_evenly(sample: pictures.Sample) -> None:
+    cloud = viewer.view(shown(), most=100)["clouds"]["container"]
     assert len(base64.b64decode(cloud["values"]["height"])) == 100
     heights = np.frombuffer(base64.b64decode(cloud["values"]["height"]), "u1")
     assert heights.max() > 240, "points of the back, which come last"

@@ -279,15 +279,25 @@ def gc(dataset: LastDataset = None, dry_run: DryRun = False, as_json: Json = Fal
 @app.command("show", epilog="Example: dapdata show data/can_cabinet --out cabinet.html")
 def show_dataset(
     dataset: LastDataset = None,
-    out: Annotated[Path | None, _option("--out", help="A .png or .html file", default="both, named after the dataset")] = None,
+    out: Annotated[
+        Path | None,
+        _option("--out", help="A .png or .html file, with --rerun an .rrd file", default="both, named after the dataset"),
+    ] = None,
     demo: Annotated[list[int] | None, _option("--demo", help="Number of a demo to show; may be repeated", min=0)] = None,
     count: Annotated[int, typer.Option("--count", min=1, max=64, help="How many demos, if none is named.")] = 4,
+    rerun: Annotated[bool, typer.Option("--rerun", help="Stream to the rerun viewer, or with --out to an .rrd file.")] = False,
     as_json: Json = False,
 ) -> None:
     """Draw a contact sheet (PNG) and a page with a 3-D view (HTML)."""
-    from dapdata.show import contact_sheet, show_html
+    from dapdata.show import contact_sheet, show_html, show_rerun
 
     folder = last("dataset", dataset)
+    if rerun:
+        if out is not None and out.suffix != ".rrd":
+            raise UsageError(f"--out {out}: expected an .rrd file with --rerun, or no --out for the viewer")
+        shown = show_rerun(folder, out, demo, count)
+        show({"files": [str(shown)] if shown else []}, as_json, str(shown or "shown in the rerun viewer"))
+        return
     targets = [out] if out is not None else [Path(f"{folder.resolve().name}{suffix}") for suffix in (".png", ".html")]
     if any(target.suffix not in (".png", ".html") for target in targets):
         raise UsageError(f"--out {out}: expected a .png or .html file")
@@ -420,12 +430,20 @@ def judge(
 def compare(
     a: Annotated[Path, typer.Argument(help="report.json of one method.")],
     b: Annotated[Path, typer.Argument(help="report.json of another, on the same scenes.")],
+    out: Annotated[Path | None, _option("--out", help="Page to write, an .html file", metavar="FILE")] = None,
     as_json: Json = False,
 ) -> None:
     """Compare two reports scene by scene. With McNemar's paired test."""
     from dapdata.report import compare as compare_reports
 
+    if out is not None and out.suffix != ".html":
+        raise UsageError(f"--out {out}: expected an .html file")
     found = compare_reports(a, b)
+    if out is not None:
+        from daptrain.page import comparison_page
+
+        out.parent.mkdir(parents=True, exist_ok=True)
+        out.write_text(comparison_page(a, b), encoding="utf-8")
     show(found, as_json, comparison_text(found))
 
 

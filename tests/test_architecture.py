@@ -28,9 +28,9 @@ LINES = (
     ("croissant",),
     ("plan", "units"),
     ("pipeline",),
-    ("loading", "draw", "schemas"),
-    ("metrics", "health", "pictures"),
-    ("viewer",),
+    ("loading", "draw", "schemas", "plots"),
+    ("metrics", "health", "pictures", "page"),
+    ("viewer", "live"),
     ("show", "bench", "doctor", "interop"),
     ("cli",),
     ("__main__",),
@@ -45,7 +45,7 @@ MUST_NOT_KNOW = {
 }
 DAPTRAIN_MAY_KNOW = {
     "loading", "metrics", "records", "poses", "simulate", "errors", "rng", "config", "solids", "report", "predictions",
-    "pictures", "draw", "matching", "clouds", "console",
+    "pictures", "draw", "page", "plots", "viewer", "matching", "clouds", "console",
     "cluster",  # a user's own cloud must be partitioned as the training clouds were
 }  # fmt: skip
 DOORS = {
@@ -58,8 +58,24 @@ DOORS = {
     "pebble": {"engines"},
     "torch": {"loading", "daptrain"},
     "yaml": {"strict_yaml"},
+    "plotly": {"plots"},
+    "rerun": {"live"},
 }
-HEAVY = ("pybullet", "numba", "open3d", "trimesh", "torch", "scipy", "matplotlib", "zarr", "pyarrow", "pandas", "rich")
+HEAVY = (
+    "pybullet",
+    "numba",
+    "open3d",
+    "trimesh",
+    "torch",
+    "scipy",
+    "matplotlib",
+    "zarr",
+    "pyarrow",
+    "pandas",
+    "rich",
+    "plotly",
+    "rerun",
+)
 QUATERNION_WORDS = ("quat", "getEulerFromQuaternion", "as_quat")
 
 

@@ -174,4 +174,4 @@ def _nested(arrays: Sequence[Array], kind: Any) -> Any:
 
 
 def _preview(sample: Any) -> bytes:
-    return pictures.png(pictures.preview(sample, *PANEL))
+    return pictures.file(pictures.preview(sample, *PANEL))

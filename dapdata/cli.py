@@ -279,15 +279,25 @@ def gc(dataset: LastDataset = None, dry_run: DryRun = False, as_json: Json = Fal
 @app.command("show", epilog="Example: dapdata show data/can_cabinet --out cabinet.html")
 def show_dataset(
     dataset: LastDataset = None,
-    out: Annotated[Path | None, _option("--out", help="A .png or .html file", default="both, named after the dataset")] = None,
+    out: Annotated[
+        Path | None,
+        _option("--out", help="A .png or .html file, with --rerun an .rrd file", default="both, named after the dataset"),
+    ] = None,
     demo: Annotated[list[int] | None, _option("--demo", help="Number of a demo to show; may be repeated", min=0)] = None,
     count: Annotated[int, typer.Option("--count", min=1, max=64, help="How many demos, if none is named.")] = 4,
+    rerun: Annotated[bool, typer.Option("--rerun", help="Stream to the rerun viewer, or with --out to an .rrd file.")] = False,
     as_json: Json = False,
 ) -> None:
     """Draw a contact sheet (PNG) and a page with a 3-D view (HTML)."""
-    from dapdata.show import contact_sheet, show_html
+    from dapdata.show import contact_sheet, show_html, show_rerun
 
     folder = last("dataset", dataset)
+    if rerun:
+        if out is not None and out.suffix != ".rrd":
+            raise UsageError(f"--out {out}: expected an .rrd file with --rerun, or no --out for the viewer")
+        shown = show_rerun(folder, out, demo, count)
+        show({"files": [str(shown)] if shown else []}, as_json, str(shown or "shown in the rerun viewer"))
+        return
     targets = [out] if out is not None else [Path(f"{folder.resolve().name}{suffix}") for suffix in (".png", ".html")]
     if any(target.suffix not in (".png", ".html") for target in targets):
         raise UsageError(f"--out {out}: expected a .png or .html file")
@@ -420,12 +430,20 @@ def judge(
 def compare(
     a: Annotated[Path, typer.Argument(help="report.json of one method.")],
     b: Annotated[Path, typer.Argument(help="report.json of another, on the same scenes.")],
+    out: Annotated[Path | None, _option("--out", help="Page to write, an .html file", metavar="FILE")] = None,
     as_json: Json = False,
 ) -> None:
     """Compare two reports scene by scene. With McNemar's paired test."""
     from dapdata.report import compare as compare_reports
 
+    if out is not None and out.suffix != ".html":
+        raise UsageError(f"--out {out}: expected an .html file")
     found = compare_reports(a, b)
+    if out is not None:
+        from daptrain.page import comparison_page
+
+        out.parent.mkdir(parents=True, exist_ok=True)
+        out.write_text(comparison_page(a, b), encoding="utf-8")
     show(found, as_json, comparison_text(found))
 
 
@@ -502,6 +520,79 @@ def run(
     files = {"dataset": dataset, "run": target, "report": target / "report.html"} | _leave_behind(dataset, target)
     made = {name: str(path) for name, path in files.items()}
     show({**made, "result": report}, as_json, made_text(report, made))
+
+
+# Other formats ---------------------------------------------------------------------------------------------
+
+exports = typer.Typer(no_args_is_help=True, rich_markup_mode=None, epilog="Example: dapdata export parquet DATASET --out DIR")
+app.add_typer(exports, name="export", help="Write a dataset in the format of other tools.")
+
+Target = Annotated[Path, _option("--out", help="Folder to write; must be new or empty", metavar="DIR")]
+OneSplit = Annotated[Split | None, _option("--split", help="Only this split", default="all, each in files of its own")]
+AtMost = Annotated[int | None, _option("--demos", help="Only so many demos, the first ones", default="all", min=1, metavar="N")]
+InFile = Annotated[int | None, _option("--shard-size", help="Demos in a file", default="the format's", min=1, metavar="N")]
+
+
+@exports.command("webdataset", epilog="Example: dapdata export webdataset data/can_cabinet --out tars --shard-size 200")
+def export_webdataset(
+    out: Target,
+    dataset: LastDataset = None,
+    split: OneSplit = None,
+    demos: AtMost = None,
+    shard_size: InFile = None,
+    as_json: Json = False,
+) -> None:
+    """Tar files of npy and json, to be streamed. One sample a demo; 500 in a file."""
+    _export("webdataset", dataset, out, as_json, split=split, demos=demos, shard_size=shard_size)
+
+
+@exports.command("parquet", epilog="Example: dapdata export parquet data/can_cabinet --out hub --no-previews")
+def export_parquet(
+    out: Target,
+    dataset: LastDataset = None,
+    split: OneSplit = None,
+    demos: AtMost = None,
+    shard_size: InFile = None,
+    previews: Annotated[bool, typer.Option("--previews/--no-previews", help="Draw a picture of each demo.")] = True,
+    as_json: Json = False,
+) -> None:
+    """Parquet files for the Hugging Face viewer, datasets, pandas. One row a demo; 1000 in a file."""
+    _export("parquet", dataset, out, as_json, split=split, demos=demos, shard_size=shard_size, previews=previews)
+
+
+@exports.command("pointcept", epilog="Example: dapdata export pointcept data/can_cabinet --out pointcept/data/can_cabinet")
+def export_pointcept(
+    out: Target,
+    dataset: LastDataset = None,
+    split: OneSplit = None,
+    demos: AtMost = None,
+    as_json: Json = False,
+) -> None:
+    """Folders of npy for Pointcept's DefaultDataset. Where to place, as segmentation of the clouds."""
+    _export("pointcept", dataset, out, as_json, split=split, demos=demos)
+
+
+@exports.command("scenes", epilog="Example: dapdata export scenes data/can_cabinet --out scenes --split test --demos 20")
+def export_scenes(
+    out: Target,
+    dataset: LastDataset = None,
+    split: OneSplit = None,
+    demos: AtMost = None,
+    as_json: Json = False,
+) -> None:
+    """GLB and URDF of the true scenes. Container and clutter, the object, every goal as a frame."""
+    _export("scenes", dataset, out, as_json, split=split, demos=demos)
+
+
+def _export(kind: str, dataset: Path | None, out: Path, as_json: bool, **options: Any) -> None:
+    """Runs one export; options that were not given are the format's own."""
+    from importlib import import_module
+
+    folder, write = last("dataset", dataset), import_module(f"dapdata.interop.{kind}").export
+    given = {name: value for name, value in options.items() if value is not None}
+    with progress(f"export {kind}", "demo") as advance:
+        made = write(folder, out, **given, progress=advance)
+    show({"out": str(made), "format": kind, "dataset": str(folder), **options}, as_json, str(made))
 
 
 # Around ----------------------------------------------------------------------------------------------------

@@ -88,7 +88,12 @@ def staged(root: Path, name: str) -> Iterator[Path]:
 
 
 def commit(folder: Path, target: Path) -> bool:
-    """Moves a staged folder to its place for good; False if there is something already (then nothing is moved)."""
+    """Moves a staged folder to its place for good; False if there is something already (then nothing is moved).
+
+    A single file may be moved too; it replaces one that has its name.
+    """
+    if folder.is_file():
+        _fsync(folder)
     for path, _, files in os.walk(folder, topdown=False):
         for file in sorted(files):
             _fsync(Path(path, file))

@@ -108,9 +108,10 @@ def verify(root: str | Path, *, quick: bool = False, progress: Progress | None =
     found = manifest.read(root)
     problems = list(_single_files(root, found)) + list(_extra_files(root, found))
     files, claims = len(found.files), _Claims(root, found)
-    total = sum(len(stage.units) for stage in found.stages.values())
+    is_slim = _is_slim(root, found)
+    total = len(found.shards) if is_slim else sum(len(stage.units) for stage in found.stages.values())
     try:
-        for done, (entry, is_shard) in enumerate(_units(found), 1):
+        for done, (entry, is_shard) in enumerate(_units(found, is_slim), 1):
             record, damage = _unit_files(root, entry)
             files += len(record["files"]) if record else 0
             problems += damage
@@ -127,10 +128,17 @@ def verify(root: str | Path, *, quick: bool = False, progress: Progress | None =
     return Audit(str(root), tuple(problems), tuple(notes), files, 0 if quick else claims.demos, found.content_sha256)
 
 
-def _units(found: Manifest) -> Iterator[tuple[UnitEntry, bool]]:
-    """Each unit once, shards first, and whether it is one. (The units of the last stage are the shards.)"""
+def _is_slim(root: Path, found: Manifest) -> bool:
+    """Whether this is a copy of the shards alone: all upstream units were left behind, as when only readers are served."""
+    return bool(found.shards) and not (root / "stages").exists()
+
+
+def _units(found: Manifest, is_slim: bool = False) -> Iterator[tuple[UnitEntry, bool]]:
+    """Each unit once, shards first, and whether it is one; of a slim copy the shards alone."""
     yield from ((entry, True) for entry in found.shards)
-    shards = {entry.path for entry in found.shards}
+    if is_slim:
+        return
+    shards = {entry.path for entry in found.shards}  # the units of the last stage are the shards
     for stage in found.stages.values():
         yield from ((entry, False) for entry in stage.units if entry.path not in shards)
 
@@ -264,6 +272,8 @@ def _leaks(index: Index, found: Manifest) -> Iterator[str]:
 
 
 def _notes(root: Path, found: Manifest) -> Iterator[str]:
+    if _is_slim(root, found):
+        yield "stages/ is not here: the shards are complete in themselves, but cannot be labelled again"
     unnamed = _unnamed(root, found)
     if unnamed:
         size = sum(_size(path) for path in unnamed)

@@ -34,6 +34,7 @@ MANIFEST = "manifest.json"
 INDEX = "index.parquet"
 UNITS = "units.parquet"  # of datasets of format 2
 CARD = "README.md"
+CROISSANT = "croissant.json"
 PREVIEWS = "preview"
 PROGRESS = "progress.json"  # what a running or interrupted command works on
 LOG = "log.jsonl"  # when each unit was made, by whom, how long it took: never read by the data's users
@@ -300,7 +301,7 @@ def _text(manifest: Manifest, table: bytes | Path | None) -> bytes:
 
 def single_files(root: Path) -> list[str]:
     """The single files that belong to datasets and are there, whether or not a manifest survived that names them."""
-    found = [root / INDEX, root / UNITS, root / CARD, *(root / PREVIEWS).glob("*")]
+    found = [root / INDEX, root / UNITS, root / CARD, root / CROISSANT, *(root / PREVIEWS).glob("*")]
     return [path.relative_to(root).as_posix() for path in found if path.is_file()]
 
 

@@ -7,7 +7,7 @@ cylinder's axis is its own z.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from hashlib import sha256
 from typing import Any, NamedTuple
@@ -74,6 +74,35 @@ def open_shelf(width: float, depth: float, pitch: float, shelves: int, board: fl
     return [*floors, back, *sides, *top]
 
 
+def plate_with_holes(x: Array, y: Array, opening: float, margin: tuple[float, float], bottom: float, top: float) -> list[Part]:
+    """A level plate with a grid of square holes, as boxes that meet without overlap: bars along y, and short ones between.
+
+    Args:
+        x: (R,) places of the holes along x, rising, m.
+        y: (C,) the same along y.
+        opening: Side of the holes, m; less than any two are apart.
+        margin: Plate beyond the outermost holes along x and along y, m.
+        bottom: Height of the underside, m.
+        top: Height of the upper face, m.
+    """
+    across, along = _beside_holes(x, opening, margin[0]), _beside_holes(y, opening, margin[1])
+    width, height, z = along[-1][1] - along[0][0], top - bottom, (top + bottom) / 2
+    middle = (along[-1][1] + along[0][0]) / 2
+    bars = [box((high - low, width, height), ((low + high) / 2, middle, z)) for low, high in across]
+    return bars + [box((opening, high - low, height), (at, (low + high) / 2, z)) for at in x for low, high in along]
+
+
+def _beside_holes(places: Array, opening: float, margin: float) -> list[tuple[float, float]]:
+    """(low, high) of what is before, between and after openings around some places along a line, m."""
+    edges = [places[0] - opening / 2 - margin, *(at + side * opening / 2 for at in places for side in (-1, 1))]
+    return list(zip(edges[::2], [*edges[1::2], places[-1] + opening / 2 + margin]))
+
+
+def moved(parts: Sequence[Part], T: Array) -> list[Part]:
+    """The parts of a group after a motion T (4, 4) of all of it."""
+    return [part._replace(T=T @ part.T) for part in parts]
+
+
 def collect(parts: Sequence[Part]) -> tuple[Array, Array, Array, Array]:
     """kind (P,) u1, size (P, 3) f8, T (P, 4, 4) f8 and role (P,) u1 of at least one part."""
     return (
@@ -106,6 +135,13 @@ def bounds(kind: Array, size: Array, T: Array) -> Array:
     extent = np.where((kind == BOX)[:, None], box_half, np.where((kind == CYLINDER)[:, None], disc_half, round_half))
     centre = T[:, :3, 3]
     return np.stack([centre - extent, centre + extent], axis=1)
+
+
+def centre_of_mass(kind: Array, size: Array, T: Array) -> Array:
+    """(3,) centre of mass of solids of one density, m; where they overlap counts twice."""
+    _refuse_meshes(kind)
+    volume = size.prod(axis=1) * np.array([1.0, np.pi / 4, np.pi / 6])[kind]
+    return np.asarray(volume @ T[:, :3, 3] / volume.sum())
 
 
 def signed_distance(points: Array, kind: Array, size: Array, T: Array) -> Array:
@@ -330,6 +366,46 @@ def to_trimesh(kind: Array, size: Array, T: Array, sections: int = 64) -> Any:
             mesh.apply_scale(full)
         meshes.append(mesh.apply_transform(pose_))
     return trimesh.util.concatenate(meshes)
+
+
+class Node(NamedTuple):
+    """A frame of a GLB file, with a mesh in it or none."""
+
+    name: str  # unique
+    parent: str  # a node before it; "" for the world
+    T: Array  # (4, 4) T_parent_node, m
+    mesh: str = ""  # several nodes may show the same mesh
+
+
+Color = tuple[float, float, float, float]  # red, green, blue, opacity; each from 0 to 1
+Z_UP = "z_up"  # the node of a GLB file that is the world frame
+T_GLTF_WORLD = np.array([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])  # glTF's y is up, by its definition
+
+
+def to_glb(nodes: Sequence[Node], meshes: Mapping[str, tuple[Any, Color]]) -> bytes:
+    """A scene as a binary glTF file, in metres; its node `Z_UP` is the world frame, the parent of all others.
+
+    Args:
+        nodes: In an order in which parents come first.
+        meshes: By name, a `trimesh.Trimesh` and its colour.
+    """
+    trimesh = require("trimesh", "sim")
+    scene = trimesh.Scene()
+    scene.graph.update(frame_to=Z_UP, matrix=T_GLTF_WORLD)
+    for name, (mesh, color) in meshes.items():
+        mode = "BLEND" if color[3] < 1 else "OPAQUE"
+        material = trimesh.visual.material.PBRMaterial(
+            name=name, baseColorFactor=color, metallicFactor=0.0, roughnessFactor=0.8, alphaMode=mode
+        )
+        mesh = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+        mesh.visual = trimesh.visual.TextureVisuals(material=material)
+        scene.geometry[name] = mesh
+    for node in nodes:
+        scene.graph.update(
+            frame_from=node.parent or Z_UP, frame_to=node.name, matrix=node.T, **({"geometry": node.mesh} if node.mesh else {})
+        )
+    data: bytes = scene.export(file_type="glb")
+    return data
 
 
 def _triple(values: Vector) -> tuple[float, float, float]:

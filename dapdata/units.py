@@ -17,7 +17,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from dapdata import card, durable, manifest, rng, split, store
+from dapdata import card, croissant, durable, manifest, rng, split, store
 from dapdata.config import SplitConfig
 from dapdata.errors import CorruptionError, DapdataError, UsageError
 from dapdata.manifest import Manifest, Rejects, SplitEntry, StageEntry, UnitEntry
@@ -241,7 +241,7 @@ def _row(demo: int, sample: store.Sample, is_shard: bool) -> dict[str, Any]:
 
 def describe(sample: store.Sample) -> dict[str, int]:
     """Seed, instances and counts of one demo."""
-    meta = {name: int(sample[f"meta/{name}"]) for name in ("seed", "container_instance", "object_instance", "attempts")}
+    meta = {name: int(sample[f"meta/{name}"]) for name in ("seed", "container_instance", "object_instance", "attempts", "task")}
     counts = {name: len(sample[path]) for name, path in COUNTED.items()}
     return meta | counts | {"positives": int((sample["container_superpoints/affordance"] > 0).sum())}
 
@@ -330,8 +330,9 @@ def _gather(
 
 def _index_row(recipe: Mapping[str, Any], shard: str, number: int, row: Mapping[str, Any]) -> dict[str, Any]:
     """A row of the index, but for the split."""
-    place = {"shard": shard, "row": number, "task": recipe["scene"]["task"]}
-    return {"demo": row["demo"], **place, **{k: v for k, v in row.items() if k != "demo"}}
+    names = [scene["task"] for scene in recipe["scene"].get("scenes", [recipe["scene"]])]
+    place = {"shard": shard, "row": number, "task": names[row["task"]]}
+    return {"demo": row["demo"], **place, **{k: v for k, v in row.items() if k not in ("demo", "task")}}
 
 
 def _index(folder: Path, config: SplitConfig, seed: int) -> Index | None:
@@ -363,11 +364,14 @@ def _splits(index: Index, large: bool) -> dict[str, SplitEntry]:
 def _write(root: Path, now: Manifest, tables: Mapping[str, Path], previews: Mapping[str, bytes]) -> None:
     """Publishes a manifest with its tables and the files that follow from them."""
     index = Index(tables[manifest.INDEX]) if manifest.INDEX in tables else None
-    means = {name: float(index[name].sum()) / index.rows for name in card.MEANS} if index else {}
-    about = now.model_copy(update={"shards": [], "stages": {}}).model_dump(mode="json")
+    facts = now.model_copy(update={"shards": [], "stages": {}}).model_dump(mode="json")
     stages = {name: entry.spec for name, entry in now.stages.items() if entry.units}
-    text = card.render(about, stages, len(now.shards), index.rows if index else 0, means, sorted(previews))
-    manifest.publish(root, now, {**tables, **previews, manifest.CARD: text.encode()})
+    demos = index.rows if index else 0
+    about = {manifest.CARD: card.render(facts, stages, demos, index or {}, sorted(previews)).encode()}
+    if index:
+        folders = sorted({shard.path.rpartition("/")[0] for shard in now.shards})
+        about[manifest.CROISSANT] = croissant.render(facts, folders, index)
+    manifest.publish(root, now, {**tables, **previews, **about})
 
 
 def attach(root: Path, pictures: Mapping[str, bytes]) -> None:

@@ -32,6 +32,7 @@ reader never sees half of a dataset. Its fields are in [`schemas/manifest.schema
 | `index.parquet` | one row per demo: split, shard, row, instances, counts, rejects |
 | `units.parquet` | large datasets only: one row per unit, see below |
 | `README.md`, `preview/` | dataset card and pictures |
+| `croissant.json` | the same for machines: files, columns of the index, arrays of a shard (Croissant, JSON-LD) |
 | `shards/<labelling>/00000.zarr` | the product: self-contained groups, ready to train on |
 | `stages/<stage>/<key>` | cached units of the upstream stages; only needed to label again or to go on |
 
@@ -146,8 +147,8 @@ def _key_table(root: Any, paths: Any, skip: int) -> str:
 
 
 def _default(root: Any, path: Any) -> Any:
-    """The default of a key: that of the outermost section which states one."""
-    for n in range(1, len(path) + 1):
+    """The default of a key: its own, or that of the innermost section which states one."""
+    for n in range(len(path), 0, -1):
         value = keys.at(root, path[:n]).get("default")
         if value is not None:
             for part in path[n:]:

@@ -1,239 +1,242 @@
-"""The pages for whoever starts, loads or compares: their snippets run, their site builds, and no link in it is dead."""
+"""Pages of evaluations and what pages are made of: they say what the report says, load nothing, and take hostile names."""
 
 from __future__ import annotations
 
 import json
-import os
 import re
-import runpy
-import socket
-import subprocess
-import sys
-from collections.abc import Iterator
-from html.parser import HTMLParser
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
-from urllib.parse import unquote
 
+import numpy as np
 import pytest
-from test_docs import ROOT, blocks
 
-import dapdata
-from dapdata import errors, keys, recipe
+pytest.importorskip("matplotlib")
+pytest.importorskip("pybullet")
 
-DOCS = ROOT / "docs"
-LOADING = (DOCS / "loading.md").read_text(encoding="utf-8")
-NOTEBOOK = DOCS / "read_shards.ipynb"
-ENVIRONMENT = os.environ | {
-    "OMP_NUM_THREADS": "1",
-    "PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "train"), *filter(None, [os.environ.get("PYTHONPATH")])]),
-    "MPLBACKEND": "Agg",
-}
+from browser import needs_browser, open_page
 
+from dapdata import cli, loading, metrics, page, plots
+from dapdata import predictions as files
+from dapdata.poses import pose
+from dapdata.records import Placement
+from dapdata.report import Interval, Report
+from daptrain import page as pages
+from daptrain.curve import Asked, Curve, Figures, Point
+from daptrain.page import Material
 
-@pytest.fixture
-def beside_data(tiny_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A working directory in which the dataset that the pages name is the tiny one."""
-    (tmp_path / "data").mkdir()
-    (tmp_path / "data/quickstart").symlink_to(tiny_dataset)
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
-
-
-def snippet(*words: str) -> str:
-    """The one snippet of loading.md that has all these words."""
-    (found,) = [block for block in blocks(LOADING, "python") if all(word in block for word in words)]
-    return found
+HOSTILE = """</script><script>problems.push("ran")</script><img src=x onerror='problems.push("ran")'>"&'"""
+LOG = [
+    {"net": net, "step": step, "loss": 1 / step, "seconds": 1.0, **({"val_iou": 0.5} if step == 40 else {})}
+    for net in ("affordance", "pose")
+    for step in (20, 40)
+]
 
 
-def run(code: str, **variables: str) -> str:
-    command = [sys.executable, "-c", code]
-    done = subprocess.run(command, env=ENVIRONMENT | variables, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
+@pytest.fixture(scope="module")
+def judged(tiny: Path) -> tuple[Report, Material]:
+    """Three scenes: the best candidate of the first succeeds, that of the second hangs in the air, the third has none."""
+    dataset = loading.open(tiny, "train")
+    samples = [dataset[i] for i in range(3)]
+    goals = [sample["pose/T_world_object_goal"] for sample in samples]
+    above = pose(translation=(0, 0, 0.3))
+    poses = [[goals[0], above @ goals[0]], [above @ goals[1], goals[1]], []]
+    placements = {
+        int(sample["meta/demo"]): [Placement(T, -float(rank), "ok") for rank, T in enumerate(found)]
+        for sample, found in zip(samples, poses)
+    }
+    report, results = metrics.judge_dataset(files.collect(placements), dataset, split="train", trials=3, k=2, method="mine")
+    return report, Material(results["mine"], samples, training=LOG)
 
 
-# Loading ---------------------------------------------------------------------------------------------------
+@pytest.fixture(scope="module")
+def html(judged: tuple[Report, Material]) -> str:
+    return pages.report_page(*judged, say=lambda line: None)
 
 
-@pytest.mark.usefixtures("beside_data")
-def test_a_shard_is_read_with_numpy_and_zarr_alone() -> None:
-    check = "assert len(demos) == 3 and all(len(p) == len(a) > 10 and abs(a).max() <= 1 for p, a in demos)\n"
-    run(snippet("zarr.open_group") + check + "import sys; assert not {'dapdata', 'torch'} & {*sys.modules}")
+def hostile(report: Report) -> Report:
+    """The report with hostile names wherever names come from outside."""
+    scene = report.scenes[1].model_copy(update={"reason": HOSTILE})
+    return report.model_copy(
+        update={
+            "task": HOSTILE,
+            "hardware": HOSTILE,
+            "notes": [HOSTILE],
+            "method": report.method.model_copy(update={"name": HOSTILE}),
+            "success": report.success.model_copy(update={"failures": {HOSTILE: 2}, "failures_all": {HOSTILE: 3}}),
+            "references": {f"{HOSTILE}2": report.references["oracle"]},
+            "digests": report.digests.model_copy(update={"weights": {HOSTILE: HOSTILE}}),
+            "split": report.split.model_copy(update={"name": HOSTILE}),
+            "scenes": [report.scenes[0], scene, report.scenes[2]],
+        }
+    )
 
 
-@pytest.mark.usefixtures("beside_data")
-def test_samples_blocks_and_chosen_demos_are_read_without_torch() -> None:
-    check = """
-assert goal.shape == (4, 4) and len(counts) == len(train) == 3 and len(cloud) > 100
-assert [len(s["goals/T_world_object"]) >= 2 for s in samples] == [True] * len(rich) and len(rich) > 0
-import sys; assert "torch" not in sys.modules
-"""
-    run(snippet("train.block") + snippet("rich =") + check)
+def columns_of(html: str) -> dict[str, list[Any]]:
+    """The values of each column of a page's table."""
+    (found,) = re.findall(r'class="sortable".*?<script type="application/json">(.*?)</script>', html, re.DOTALL)
+    return {column["name"]: column["values"] for column in json.loads(found)}
 
 
-@pytest.mark.usefixtures("beside_data")
-def test_padded_batches_come_from_memory_and_from_a_stream() -> None:
-    pytest.importorskip("torch")
-    scope: dict[str, Any] = {"train": dapdata.open("data/quickstart", split="train")}  # as in the snippet before
-    exec(compile(snippet("collate_fn=collate"), "docs/loading.md", "exec"), scope)
-    assert scope["known"].any()
-    points, affordance = (scope["batch"][path] for path in scope["PATHS"])
-    assert points.shape[:2] == affordance.shape
-    assert scope["stream"].state_dict()["epoch"] == 2
+def test_the_table_of_scenes_says_what_the_report_says(judged: tuple[Report, Material], html: str) -> None:
+    report, material = judged
+    columns = columns_of(html)
+    assert columns["demo"] == [row.demo for row in report.scenes]
+    assert columns["result"][0] == "success"
+    assert columns["result"][2] == "no prediction"
+    assert columns["succeed"] == [row.successes for row in report.scenes] == [1, 1, 0]
+    assert columns["off"][0] == pytest.approx(0, abs=1e-6)
+    assert columns["off"][1] > 200, "mm, in the air"
+    assert columns["off"][2] is columns["clearance"][2] is columns["push"][2] is None
+    goal = material.samples[0]["goals/clearance"][material.results[0].distance[0].argmin()]
+    assert columns["clearance"][0] == pytest.approx(1000 * goal)
 
 
-@pytest.mark.slow
-@pytest.mark.usefixtures("beside_data")
-def test_ranks_train_together_on_demos_of_their_own() -> None:
-    pytest.importorskip("torch")
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        where = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(free.getsockname()[1]), "WORLD_SIZE": "2"}
-    code = snippet("DistributedDataParallel") + "\nprint(seen, *[p.sum().item() for p in model.parameters()])"
-    ranks = [
-        subprocess.Popen(
-            [sys.executable, "-c", code], env=ENVIRONMENT | where | {"RANK": rank}, stdout=subprocess.PIPE, text=True
-        )
-        for rank in "01"
-    ]
-    out = [rank.communicate(timeout=300)[0].split() for rank in ranks]
-    assert out[0] == out[1], "the same steps, and the same weights"
-    assert out[0][0] == "2"  # three demos of the train split: one for each rank, in two passes
+def test_failures_of_each_reason_come_first_in_3d_with_their_candidates(html: str) -> None:
+    views = json.loads(re.findall(r'id="views">(.*?)</script>', html, re.DOTALL)[0])["views"]
+    states = [view["name"].split(": ")[1] for view in views]
+    assert states[-1] == "success"
+    assert "no prediction" in states
+    assert len(set(states)) == 3
+    layers = {state: {layer["name"]: layer for layer in view["layers"]} for state, view in zip(states, views)}
+    assert "prediction" not in layers["no prediction"]
+    assert layers["success"]["prediction"]["says"] == ["rank 0: success"]
+    assert layers["success"]["other candidates"]["says"][0].startswith("rank 1: ")
+    assert "verified goals" in layers["success"]
+    assert "demonstrated goal" not in layers["success"]
 
 
-@pytest.mark.usefixtures("beside_data")
-def test_fixed_numbers_of_rows_go_to_jax() -> None:
-    if find_spec("jax") is None:
-        pytest.skip("jax is not installed; the snippet of docs/loading.md is run where it is: pip install jax")
-    run(snippet("import jax") + "\nassert points.shape[1:] == (64, 3) and score.shape[1:] == (64,) and (weights != 0).all()")
+def test_without_scenes_log_and_film_their_sections_are_left_out(judged: tuple[Report, Material]) -> None:
+    report, material = judged
+    bare = pages.report_page(report, Material(material.results), say=lambda line: None)
+    for heading in ("In 3-D", "Training", "From noise to one place", "Some successes"):
+        assert f"<h2>{heading}</h2>" not in bare
+    assert columns_of(bare)["result"][0] == "success"
 
 
-# The notebook ----------------------------------------------------------------------------------------------
+def test_a_report_of_before_clearances_were_counted_has_a_page(judged: tuple[Report, Material]) -> None:
+    report, material = judged
+    old = report.model_dump(mode="json", by_alias=True)
+    for summary in (old, *old["references"].values()):
+        del summary["success"]["success_by_clearance_mm"]
+    assert "Success by clearance" not in pages.report_page(Report.model_validate(old), Material(material.results), print)
 
 
-def cells(kind: str) -> list[str]:
-    return ["".join(cell["source"]) for cell in json.loads(NOTEBOOK.read_text())["cells"] if cell["cell_type"] == kind]
+def test_hostile_names_stay_text_in_a_report(judged: tuple[Report, Material]) -> None:
+    report, material = judged
+    html = pages.report_page(hostile(report), material, say=lambda line: None)
+    assert "<script>problems" not in html
+    assert "<img src=x" not in html.replace("\\u003c", "(")
 
 
-def test_the_notebook_reads_a_shard_and_draws_a_demo(beside_data: Path) -> None:
-    pytest.importorskip("matplotlib")
-    (beside_data / "docs").mkdir()
-    os.chdir(beside_data / "docs")
-    check = """
-figure.savefig("figure.png")
-assert len(placed) == len(goals) >= 1
-inside = [((p > container.min(0) - 0.02) & (p < container.max(0) + 0.02)).all(1).mean() for p in placed]
-assert min(inside) > 0.9, inside
-import sys; assert not {'dapdata', 'torch'} & {*sys.modules}
-"""
-    out = run("\n".join(cells("code")) + check)
-    assert out.startswith("can_cabinet in 2 shards")
-    assert (beside_data / "docs/figure.png").stat().st_size > 10_000
+def test_two_reports_become_a_page(judged: tuple[Report, Material], tmp_path: Path) -> None:
+    report, _ = judged
+    other = report.model_copy(update={"scenes": [row.model_copy(update={"success": False}) for row in report.scenes]})
+    for name, one in (("a", report), ("b", other)):
+        (tmp_path / f"{name}.json").write_text(one.model_dump_json(by_alias=True))
+    command = ["compare", str(tmp_path / "a.json"), str(tmp_path / "b.json"), "--out"]
+    assert cli.run_app([*command, str(tmp_path / "new/both.html")]) == 0
+    html = (tmp_path / "new/both.html").read_text()
+    assert columns_of(html)["succeeds"] == ["a", "neither", "neither"]
+    assert "mine and mine" in html
+    assert cli.run_app([*command, str(tmp_path / "both.png")]) == 2
 
 
-def test_the_notebook_is_committed_without_outputs() -> None:
-    found = json.loads(NOTEBOOK.read_text())
-    assert found["nbformat"] == 4
-    assert all(cell["outputs"] == [] and cell["execution_count"] is None for cell in found["cells"] if "outputs" in cell)
-    assert len(cells("markdown")) >= 3
+def curve() -> Curve:
+    """Two sizes whose figures are made up."""
+    rate = Interval(value=0.5, n=10, ci95=(0.24, 0.76))
+    names = [name for name in metrics.Success.model_fields if name.startswith("success_") and not name.endswith("_mm")]
+    success = metrics.Success(**dict.fromkeys(names, rate), failures={}, failures_all={})
+    figures = Figures(success=success, recall={"1": rate, "8": rate})
+    points = [Point(demos=n, success=success, recall=figures.recall, cost=metrics.Cost()) for n in (10, 40)]
+    judging = {"split": "test", "trials": 10, "protocol": "strict", "k": 8, "draws": 8}
+    training = {"method": "dap", "minutes": None, "steps": 600}
+    asked = Asked(task=HOSTILE, dataset="0" * 64, data=HOSTILE, training=training, judging=judging)
+    return Curve(asked=asked, references={"heuristic": figures}, points=points)
 
 
-# Glossary and errors ---------------------------------------------------------------------------------------
+def test_a_curve_that_has_no_size_yet_has_a_page() -> None:
+    now = curve().model_copy(update={"points": [], "references": {}})
+    assert "No size is done yet." in pages.curve_page(now)
 
 
-def test_every_default_of_the_glossary_is_the_default() -> None:
-    schema = recipe.recipe_class("can_cabinet").model_json_schema()
-    page = (DOCS / "glossary.md").read_text(encoding="utf-8")
-    rows = re.findall(r"^\| \S+ \| `([a-z_.]+)` \| (\S+) \| ([0-9.]+) \|", page, re.MULTILINE)
-    assert len(rows) >= 6
-    for name, unit, default in rows:
-        body = keys.at(schema, tuple(name.split(".")))
-        assert (body["default"], body.get("unit", "1")) == (float(default), unit), name
+# What pages are made of --------------------------------------------------------------------------------------
 
 
-def test_every_array_that_the_glossary_names_is_in_a_shard() -> None:
-    from dapdata.records import columns
-
-    page = (DOCS / "glossary.md").read_text(encoding="utf-8")
-    paths = {column.metadata["path"] for column in columns()}
-    named = set(re.findall(r"`([a-z_]+/[A-Za-z_]+)`", page))
-    assert len(named) >= 6
-    assert named <= paths
-
-
-def test_every_exit_code_is_explained() -> None:
-    page = (DOCS / "errors.md").read_text(encoding="utf-8")
-    codes = {cls.exit_code for cls in vars(errors).values() if isinstance(cls, type) and issubclass(cls, errors.DapdataError)}
-    explained = {int(code) for code in re.findall(r"^\| (\d+) \| [a-z]", page, re.MULTILINE)}
-    assert explained == codes | {0, 130}
+def test_histograms_take_one_value_none_and_many() -> None:
+    for values in (np.array([3]), np.arange(1000) / 7, np.array([2.5, 2.5])):
+        counted = plots.histogram(values).data[0]
+        assert sum(counted.y) == len(values)
+        assert len(counted.x) == len(counted.customdata)
+    assert plots.histogram(np.array([])).layout.annotations[0].text == "none"
+    assert list(plots.histogram(np.array([1, 1, 4])).data[0].customdata) == ["1", "2", "3", "4"]
 
 
-# The site --------------------------------------------------------------------------------------------------
+def test_unknown_properties_of_a_plot_are_refused() -> None:
+    with pytest.raises(ValueError, match="hight"):
+        plots.figure(100, {"type": "bar", "hight": 3})
 
 
-class Links(HTMLParser):
-    """What a page of the site leads to or shows."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.found: list[str] = []
-        self.names: set[str] = set()
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        for name, value in attrs:
-            if name in ("href", "src") and value:
-                self.found.append(unquote(value))
-            if name in ("id", "name") and value:
-                self.names.add(value)
+def test_rates_and_lines_show_their_intervals() -> None:
+    rate = Interval(value=0.5, n=10, ci95=(0.24, 0.76))
+    drawn = plots.rates({"mine": {"top": rate}}).data[0]
+    assert drawn.x[0] == 50
+    assert drawn.error_x.array[0] == pytest.approx(26)
+    assert drawn.error_x.arrayminus[0] == pytest.approx(26)
+    band, line = plots.lines([plots.Line("mine", [1, 2], [rate, rate], "red")], "K", log=True).data
+    assert list(band.y) == [76, 76, 24, 24]
+    assert list(line.y) == [50, 50]
+    assert line.customdata[0] == "50.0 % (24-76), n 10"
 
 
-def dead_links(site: Path) -> Iterator[str]:
-    parsed = {}
-    for page in site.rglob("*.html"):
-        parsed[page.resolve()] = links = Links()
-        links.feed(page.read_text(encoding="utf-8"))
-    for page, links in parsed.items():
-        for link in links.found:
-            path, _, anchor = link.partition("#")
-            target = (page.parent / path).resolve() if path else page
-            if re.match(r"[a-z]+:|//", link) or page.name == "404.html":
-                continue
-            if not target.exists():
-                yield f"{page.relative_to(site)}: {link}"
-            elif (
-                anchor
-                and target in parsed
-                and anchor not in parsed[target].names | {"__codelineno"}
-                and "codelineno" not in anchor
-            ):
-                yield f"{page.relative_to(site)}: no {anchor} in {path}"
-
-
-def build(to: Path, source: Path = ROOT) -> subprocess.CompletedProcess[str]:
-    if find_spec("material") is None:
-        pytest.skip("mkdocs-material is not installed; `make docs` installs it: pip install 'dapdata[docs]'")
-    command = [sys.executable, str(source / "docs/build_site.py"), "--to", str(to)]
-    return subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True, check=False)
+def test_nothing_can_end_the_script_that_holds_data_and_no_number_is_lost() -> None:
+    text = page.data({"a": HOSTILE, "b": 1.5}, "x")
+    assert text.count("</script>") == 1
+    assert json.loads(re.findall(r">(.*)</script>", text)[0]) == {"a": HOSTILE, "b": 1.5}
+    table = page.sortable([page.Column("a", "A", [1.5, float("nan"), None, HOSTILE])], "a>1")
+    assert columns_of(table) == {"a": [1.5, None, None, HOSTILE]}
 
 
 @pytest.mark.slow
-def test_the_site_builds_without_a_dead_link(tmp_path: Path) -> None:
-    done = build(tmp_path / "site")
-    assert done.returncode == 0, done.stderr
-    assert list(dead_links((tmp_path / "site").resolve())) == []
-    pages = {path.stem for path in DOCS.glob("*.md")}
-    assert pages <= {path.stem for path in (tmp_path / "site/docs").glob("*.html")}
-    home = (tmp_path / "site/index.html").read_text()
-    assert all(f"docs/{page}.html" in home for page in pages), "every page is in the navigation"
+@needs_browser
+def test_a_report_is_drawn_and_its_table_leads_to_the_view(html: str, tmp_path: Path) -> None:
+    script = """
+    const link = $$(".sortable td a").at(-1);
+    link.click();
+    await until(() => $("#demo").selectedOptions[0].value === link.textContent);
+    const shown = $("#demo").selectedOptions[0].text;
+    $("input[type=search]").value = "off>100";
+    $("input[type=search]").dispatchEvent(new Event("input"));
+    return { link: link.textContent, shown, far: $$(".sortable tbody tr").length, plots: $$(".plot").length,
+      prediction: $("#stage").data.filter(t => t.visible).map(t => t.name) };
+    """
+    found = open_page(html, tmp_path, script)
+    assert found["shown"].startswith(f"demo {found['link']}: ")
+    assert found["far"] == 1
+    assert found["plots"] >= 8
+    assert "verified goals" in found["prediction"]
 
 
 @pytest.mark.slow
-def test_a_dead_link_fails_the_site(tmp_path: Path) -> None:
-    runpy.run_path(str(DOCS / "build_site.py"))["copy_pages"](tmp_path / "source")
-    (tmp_path / "source/docs/new.md").write_text("# New\n\n[nowhere](nowhere.md), [no heading](errors.md#nothing-here)\n")
-    done = build(tmp_path / "site", tmp_path / "source")
-    assert done.returncode == 1
-    assert "nowhere.md" in done.stderr
-    assert "nothing-here" in done.stderr
+@needs_browser
+def test_hostile_names_are_drawn_as_text(judged: tuple[Report, Material], tmp_path: Path) -> None:
+    report, material = judged
+    html = pages.report_page(hostile(report), material, say=lambda line: None)
+    script = """
+    return { title: document.title, note: $(".note").textContent, cell: $$(".sortable td:nth-child(2)")[1].textContent,
+      plotted: [$$("text.legendtext"), $$(".ytick text")].map(all => all.some(t => t.textContent.includes("<script>"))) };
+    """
+    found = open_page(html, tmp_path, script)
+    assert found["title"] == f"{HOSTILE} on {HOSTILE}"
+    assert found["note"] == HOSTILE
+    assert found["cell"] == HOSTILE.replace("_", " ")
+    assert found["plotted"] == [True, True]
+
+
+@pytest.mark.slow
+@needs_browser
+def test_curves_are_drawn(tmp_path: Path) -> None:
+    script = "return { title: $('h1').textContent, bands: $$('.plot path.js-fill').length, rows: $$('tr').length };"
+    found = open_page(pages.curve_page(curve()), tmp_path, script)
+    assert found["title"].startswith(f"dap on {HOSTILE}")
+    assert found["bands"] == 5, "three figures of success, two of recall"
+    assert found["rows"] == 1 + 3 + 2

@@ -9,12 +9,14 @@ from hypothesis import strategies as st
 
 from dapdata.poses import (
     angle_between,
+    facing,
     inverse,
     nearest_symmetric,
     pose,
     random_rotation,
     rotate,
     rotation_about,
+    rotation_by,
     symmetric_distance,
     tilt,
     transform,
@@ -131,10 +133,39 @@ def test_half_turns_are_closed():
 @given(angles)
 def test_tilt_is_the_angle_from_upright_and_folds_where_the_symmetry_flips(angle):
     T = pose(rotation_about((1, 0, 0), angle))
-    assert tilt(T, "none") == pytest.approx(abs(angle), abs=1e-6)
-    assert tilt(T, "box") == pytest.approx(min(abs(angle), np.pi - abs(angle)), abs=1e-6)
+    assert tilt(T, "none", Z) == pytest.approx(abs(angle), abs=1e-6)
+    assert tilt(T, "box", Z) == pytest.approx(min(abs(angle), np.pi - abs(angle)), abs=1e-6)
+    assert tilt(T, "revolution", Z) == pytest.approx(min(abs(angle), np.pi - abs(angle)), abs=1e-6)
+
+
+@given(angles, angles)
+def test_tilt_forgives_a_roll_about_the_axis_of_revolution(roll, lean):
+    """Of a plate on its rim: the smallest over many turns about its axis, here y."""
+    Y = np.array([0.0, 1, 0])
+    T = pose(rotation_about((1, 0, 0), lean) @ rotation_about(Y, roll))
+    turned = [tilt(T @ pose(rotation_about(Y, turn)), "none", Y) for turn in np.linspace(-np.pi, np.pi, 721)]
+    assert tilt(T, "revolution", Y) == pytest.approx(min(turned), abs=0.006)
+
+
+def test_an_opening_that_points_up_faces_along_x():
+    T = pose(rotation_about((0, 0, 1), 0.3))
+    assert np.allclose(facing(T, np.array([0.0, 0, 1])), T[:3, 0])
+    assert np.allclose(facing(T, np.array([0.0, 0.6, 0.8])), T[:3, 1])
 
 
 def test_an_unknown_symmetry_is_named():
     with pytest.raises(ValueError, match="none, box or revolution"):
         nearest_symmetric(np.eye(4), np.eye(4), "screw", Z)
+
+
+@given(seeds, st.floats(1e-9, 3.0))
+def test_a_rotation_vector_and_its_opposite_cancel_and_its_length_is_the_angle(seed, angle):
+    direction = np.random.default_rng(seed).normal(size=3)
+    turn = angle * direction / np.linalg.norm(direction)
+    assert np.allclose(rotation_by(turn) @ rotation_by(-turn), np.eye(3), **close)
+    assert np.isclose(angle_between(rotation_by(turn), np.eye(3)), angle, **close)
+    assert np.allclose(rotation_by(turn) @ turn, turn, **close)
+
+
+def test_a_rotation_vector_of_no_length_turns_nothing():
+    assert np.array_equal(rotation_by(np.zeros(3)), np.eye(3))

@@ -84,6 +84,7 @@ def demonstrate(made: Inputs, sections: Sections, draw: Draw) -> Demo | Rejected
         goals=T_goals,
         goal_kind=rng.integers(0, 5, goals),
         goal_clearance=rng.random(goals) * sections["placement"].mass,
+        goal_approach=np.tile([1.0, 0.0, 0.0], (goals, 1)),
         rejected_goals=poses(rng, rejected),
         rejected_reason=rng.integers(0, 8, rejected),
         symmetry_kind=np.array(2),
@@ -102,6 +103,7 @@ def demonstrate(made: Inputs, sections: Sections, draw: Draw) -> Demo | Rejected
         container_instance=rng.integers(0, 2**60),
         object_instance=rng.integers(0, 2**60),
         attempts=np.array(0),
+        task=np.array(0),
     )
 
 

@@ -479,7 +479,7 @@ def run(
     """Generate, label, train and eval. Then say how well it went and where everything is."""
     from dapdata import pipeline
 
-    _need("sim", "pybullet", "numba", "pebble", "matplotlib")
+    _need("sim", "pybullet", "numba", "matplotlib")
     _need("train", "torch")
     from daptrain import evaluate as evaluate_run
     from daptrain import train as train_networks

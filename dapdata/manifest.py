@@ -62,6 +62,14 @@ class StageEntry(Section):
     units: list[UnitEntry] = Field(description="in demo order; empty if it is to be run again")
 
 
+class MissingEntry(Section):
+    """Demos that are not there because their unit failed, in a dataset that was published all the same."""
+
+    demo_range: tuple[int, int] = Field(description="first demo, and one past the last")
+    stage: str = Field(description="that failed; those after it were not run")
+    reason: str = Field(description="how its last try ended")
+
+
 class SplitEntry(Section):
     """A split and the instances in it; no instance is in two splits."""
 
@@ -84,13 +92,16 @@ class Manifest(Section):
     format: int = Field(ge=1, description="version of the format")
     name: str
     task: str
-    demos: int = Field(ge=0, description="demos asked for; those in the shards are this less rejects.demos")
+    demos: int = Field(ge=0, description="demos asked for; those in the shards are this less rejects.demos and missing")
     content_sha256: Sha256 = Field(description="over the decoded arrays of every demo, in demo order")
     recipe: dict[str, Any] = Field(description="resolved: every default filled in")
     recipe_sha256: Sha256 = Field(description="of the resolved recipe as canonical JSON")
     shards: list[UnitEntry] = Field(description="in demo order; empty until the dataset is labelled")
     splits: dict[str, SplitEntry] = Field(description="train, val, test; unused: would share an instance with two of them")
     rejects: Rejects
+    missing: list[MissingEntry] = Field(
+        default=[], description="units that failed; empty unless published with --allow-missing"
+    )
     stages: dict[str, StageEntry] = Field(description="every stage that was run; the units of the last are the shards")
     files: dict[RelativePath, Sha256] = Field(description="every other file that belongs to the dataset")
     created_by: dict[str, str] = Field(description="versions of the packages that wrote it")

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import resource
+import socket
 import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -19,10 +20,10 @@ from typing import Any
 
 from dapdata import card, durable, manifest, rng, split, store
 from dapdata.config import SplitConfig
-from dapdata.errors import CorruptionError, DapdataError, UsageError
-from dapdata.manifest import Manifest, Rejects, SplitEntry, StageEntry, UnitEntry
+from dapdata.errors import CorruptionError, DapdataError, EnvironmentProblem, UsageError
+from dapdata.manifest import Manifest, MissingEntry, Rejects, SplitEntry, StageEntry, UnitEntry
 from dapdata.records import Demo, Record, Rejected, read_record, to_sample
-from dapdata.stages import Layout, Spec, Stage, Unit
+from dapdata.stages import Layout, Spec, Stage, Unit, changes, specs
 
 CALL = "dapdata.units:run_unit"
 COUNTED = {  # column of the index: array whose rows it counts
@@ -81,6 +82,7 @@ def _make(work: Work) -> dict[str, Any]:
     table = import_module(work.table)
     stages: dict[str, Stage] = {stage.name: stage for stage in table.STAGES}
     layout = layout_of(Path(work.root), table.STAGES, work.specs, work.recipe)
+    _check_versions(work, specs(table.STAGES, work.recipe))
     recipe, unit = table.parse(work.recipe), Unit(*work.unit)
     made: dict[str, Made] = {}
     told = []
@@ -108,6 +110,16 @@ def _make(work: Work) -> dict[str, Any]:
             }
         )
     return {"made": told}
+
+
+def _check_versions(work: Work, here: Mapping[str, Spec]) -> None:
+    """Refuses to make what is keyed by other versions than those that are installed where the unit is made."""
+    differences = [line for stage in work.stages for line in changes(work.specs[stage], here[stage])]
+    if differences:
+        raise EnvironmentProblem(
+            f"{socket.gethostname()}: not what the unit is made for ({'; '.join(sorted(set(differences)))}), expected the same "
+            "versions on every machine that works; install them there"
+        )
 
 
 # Running a stage -------------------------------------------------------------------------------------------
@@ -248,9 +260,14 @@ def describe(sample: store.Sample) -> dict[str, int]:
 
 
 def publish(
-    layout: Layout, stages: Sequence[Stage], recipe: Mapping[str, Any], config: SplitConfig, units: Sequence[Unit]
+    layout: Layout,
+    stages: Sequence[Stage],
+    recipe: Mapping[str, Any],
+    config: SplitConfig,
+    units: Sequence[Unit],
+    missing: Sequence[MissingEntry] = (),
 ) -> Manifest:
-    """Writes manifest, index and card for what is there; the shards are named if all of them are.
+    """Writes manifest, index and card for what is there; a stage is named if all of its units are, but for the missing.
 
     Args:
         layout: Where units are.
@@ -258,12 +275,16 @@ def publish(
         recipe: Resolved.
         config: The recipe's split section.
         units: All units of the dataset.
+        missing: Those that failed, and that the dataset is to do without.
     """
-    whole = [stage for stage in stages if all(store.is_committed(layout.folder(stage.name, unit)) for unit in units)]
+    spared = {entry.demo_range for entry in missing}
+    there = {stage.name: [unit for unit in units if store.is_committed(layout.folder(stage.name, unit))] for stage in stages}
+    absent = {name: {(unit.start, unit.stop) for unit in {*units} - {*found}} for name, found in there.items()}
+    whole = [stage for stage in stages if there[stage.name] and absent[stage.name] <= spared]
     entries: dict[str, list[UnitEntry]] = {}
     records: dict[str, list[dict[str, Any]]] = {}
     for stage in whole:
-        pairs = [_entry(layout, stage, unit) for unit in units]
+        pairs = [_entry(layout, stage, unit) for unit in there[stage.name]]
         entries[stage.name], records[stage.name] = [pair[0] for pair in pairs], [pair[1] for pair in pairs]
     shards = entries.get(layout.shard_stage, [])
     rows = list(_index_rows(recipe, shards, records.get(layout.shard_stage, []), config))
@@ -278,6 +299,7 @@ def publish(
         shards=shards if rows else [],
         splits=_splits(rows),
         rejects=_rejects(records),
+        missing=list(missing),
         stages=_stage_entries(layout, entries),
         files={},
         created_by={"dapdata": _version()} | store.created_by(),

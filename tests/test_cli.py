@@ -157,7 +157,7 @@ def test_a_missing_simulator_is_told_by_the_command_that_needs_it(tiny_recipe: P
 
 LIGHT = """
 import sys
-for name in ("pybullet", "trimesh", "open3d", "numba", "scipy", "matplotlib", "pebble", "torch", "safetensors"):
+for name in ("pybullet", "trimesh", "open3d", "numba", "scipy", "matplotlib", "torch", "safetensors"):
     sys.modules[name] = None
 import dapdata
 from dapdata import cli

@@ -54,7 +54,7 @@ def render(manifest: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], previ
         _what(manifest, rows),
         "\n".join(f"![{path}]({path})" for path in previews),
         _splits(manifest),
-        _rejects(manifest["rejects"]),
+        _rejects(manifest["rejects"], manifest["missing"]),
         f"## Read it\n\n{LOADER}" if rows else "No shards yet: run `dapdata label` on this folder.\n",
         _arrays(),
         _how(manifest),
@@ -91,13 +91,18 @@ def _splits(manifest: Mapping[str, Any]) -> str:
     return "\n".join(["## Splits\n", *table, *lines, "", proof, ""])
 
 
-def _rejects(rejects: Mapping[str, Mapping[str, int]]) -> str:
+def _rejects(rejects: Mapping[str, Mapping[str, int]], missing: Sequence[Mapping[str, Any]]) -> str:
     words = {
         "attempts": "scenes given up (another was drawn instead)",
         "demos": "demos left out of the shards",
         "goals": "candidate goals that did not hold (kept in `rejected_goals/`)",
     }
     lines = [f"| {words[what]} | {reason} | {count} |" for what, counts in rejects.items() for reason, count in counts.items()]
+    for entry in missing:
+        start, stop = entry["demo_range"]
+        lines.append(
+            f"| demos {start} to {stop - 1}, which could not be made | {entry['reason'].replace('|', '/')} | {stop - start} |"
+        )
     return "\n".join(
         ["## What was rejected\n", "| what | reason | count |", "|---|---|---|", *(lines or ["| nothing | | |"]), ""]
     )

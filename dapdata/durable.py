@@ -178,9 +178,9 @@ def lock(root: Path, *, shared: bool = False, patience: float = 0.0) -> Iterator
             if not shared:
                 sweep(root)
             file.seek(0)
-            others = [line for line in file if line != mine] if shared else []
+            others = file.read().replace(mine, "", 1) if shared else ""
             file.truncate(0)
-            file.write("".join(others))
+            file.write(others)
 
 
 def _flock(root: Path, file: IO[str], kind: int, deadline: float) -> None:
@@ -189,6 +189,11 @@ def _flock(root: Path, file: IO[str], kind: int, deadline: float) -> None:
             fcntl.flock(file, kind | fcntl.LOCK_NB)
             return
         except OSError as error:
+            if error.errno not in (errno.EAGAIN, errno.EACCES):
+                raise EnvironmentProblem(
+                    f"{root}: cannot be locked ({error.strerror}), expected a file system with flock (Lustre: mounted with "
+                    "`flock`); choose another folder with --out"
+                ) from error
             if time.monotonic() >= deadline:
                 found = holder(root) or "another process"
                 raise LockedError(f"{root}: in use by {found}; wait for it to end, or stop it, and run again") from error

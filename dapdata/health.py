@@ -221,6 +221,9 @@ def _leaks(index: Mapping[str, Array], found: Manifest) -> Iterator[str]:
 
 
 def _notes(root: Path, found: Manifest) -> Iterator[str]:
+    for entry in found.missing:
+        first, last = entry.demo_range[0], entry.demo_range[1] - 1
+        yield f"demos {first} to {last} are missing: {entry.stage} failed: {entry.reason}; run generate and label to try again"
     count, size = len(_unnamed(root, found)), sum(_size(path) for path in _unnamed(root, found))
     if count:
         yield f"{count} units ({size / 1e6:.1f} MB) are of other recipes or labellings; `dapdata gc` frees them"
@@ -305,6 +308,7 @@ def inspect(root: str | Path) -> Facts:
         "shards": len(found.shards),
         "splits": {name: entry.demos for name, entry in found.splits.items()},
         "rejects": found.rejects.model_dump(),
+        "missing": [f"{entry.demo_range[0]} to {entry.demo_range[1] - 1}: {entry.reason}" for entry in found.missing],
         "bytes": {"shards": sum(s.bytes for s in found.shards)}
         | {name: sum(unit.bytes for unit in stage.units) for name, stage in found.stages.items()},
         "created_by": found.created_by,

@@ -25,7 +25,7 @@ LINES = (
     ("tasks",),
     ("simulate", "observe", "cluster", "labels"),
     ("recipe", "store", "stages", "engines", "manifest", "card", "report", "predictions"),
-    ("plan", "units"),
+    ("plan", "units", "slurm"),
     ("pipeline",),
     ("loading", "draw", "schemas"),
     ("metrics", "health", "pictures"),

@@ -2,7 +2,7 @@
 
 They take the place of `pipeline.STAGES` by name (`table="toy_stages"`). The variables TOY_SLEEP, TOY_CALLS and
 TOY_FAULT reach the workers through the environment: seconds a demo takes, a file that a line is added to for each call
-of a stage, and a fault such as "kill:7" or "kill:7:once" that happens at that demo.
+of a stage, and a fault such as "kill:7" that happens at that demo; "kill:7:FILE" happens once and leaves that file.
 """
 
 from __future__ import annotations
@@ -59,6 +59,9 @@ def misbehave(demo: int) -> None:
         mark.touch()
     if kind == "kill":
         os.kill(os.getpid(), signal.SIGKILL)
+    if kind == "kill_parent":
+        os.kill(os.getppid(), signal.SIGKILL)
+        time.sleep(1000)
     if kind == "abort":
         os.abort()
     if kind == "hang":

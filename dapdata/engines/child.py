@@ -207,7 +207,7 @@ def serve(socket: int, parent: int) -> None:
             told = {"answer": function(call)(text)}
         except BaseException as error:  # whatever a job raises is its failure and not this process's
             traceback.print_exc()
-            told = {"raised": f"{type(error).__name__}: {error}"}
+            told = {"raised": " ".join(f"{type(error).__name__}: {error}".split())[:TAIL]}
         if os.getpid() != me:
             os._exit(0)  # a copy that the job forked and let run on
         try:

@@ -10,6 +10,19 @@ import sys
 import time
 from pathlib import Path
 
+MEMORY = 0.3e9  # bytes: a child has 20 MB
+SIGKILL = "killed by SIGKILL (by hand, or by the kernel when memory ran out)"
+KINDS = {  # what a job does: how its end is told
+    "kill": SIGKILL,
+    "segfault": "killed by SIGSEGV",
+    "abort": "killed by SIGABRT",
+    "hang": "no answer in 1 s",
+    "raise": "ValueError: no such luck",
+    "leave": "exited with code 0",
+    "memory": "GB of memory, expected at most 0.3 GB for each worker",
+    "closed pipe": "closed the socket that its answer was to come through",
+}
+
 
 def behave(text: str) -> str:
     """What a job asks for; runs in the worker."""
@@ -38,6 +51,9 @@ def behave(text: str) -> str:
         if os.fork() == 0:
             Path(job["note"]).write_text(str(os.getpid()))
             time.sleep(1000)
+    elif do == "note and hang":
+        Path(job["note"]).write_text(str(os.getpid()))
+        time.sleep(1000)
     elif do == "copy of itself":
         os.fork()  # and both go on
     elif do == "user":

@@ -11,6 +11,7 @@ import time
 from pathlib import Path
 
 import pytest
+from bad_jobs import KINDS, MEMORY
 
 from dapdata import engines
 from dapdata.engines import child, local
@@ -18,18 +19,6 @@ from dapdata.errors import LockedError, MissingExtraError, UsageError
 
 CALL = "bad_jobs:behave"
 HERE = str(Path(__file__).parent)
-MEMORY = 0.3e9  # bytes: a child has 20 MB
-SIGKILL = "killed by SIGKILL (by hand, or by the kernel when memory ran out)"
-KINDS = {  # what a job does: how its end is told
-    "kill": SIGKILL,
-    "segfault": "killed by SIGSEGV",
-    "abort": "killed by SIGABRT",
-    "hang": "no answer in 1 s",
-    "raise": "ValueError: no such luck",
-    "leave": "exited with code 0",
-    "memory": "GB of memory, expected at most 0.3 GB for each worker",
-    "closed pipe": "closed the socket that its answer was to come through",
-}
 
 
 def run(actions: list[str], workers: int = 2, note: Path | None = None) -> tuple[list[int], dict[str, engines.Failure]]:

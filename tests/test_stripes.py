@@ -26,9 +26,9 @@ from dapdata import pipeline
 from toy_stages import toy_recipe
 verb, root, units = sys.argv[1:]
 if verb == "generate":
-    pipeline.generate(toy_recipe(8), root, units=units, table="toy_stages")
+    pipeline.generate(toy_recipe(8), root, units=units, engine="inline", table="toy_stages")
 else:
-    pipeline.label(root, units=units, table="toy_stages")
+    pipeline.label(root, units=units, engine="inline", table="toy_stages")
 """
 
 

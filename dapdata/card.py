@@ -103,7 +103,7 @@ def render(
         f"# {manifest['name']}\n\n{summary(manifest, demos, _here(index))}\n",
         "".join(f"![{_alt(path)}]({path})\n" for path in previews),
         *([f"## Read it\n\n{form.loader}", _averages(index), _splits(index)] if index else [UNLABELLED]),
-        _rejects(manifest["rejects"]),
+        _rejects(manifest["rejects"], manifest["missing"]),
         FRAMES,
         f"## Files\n\n{form.files}\n",
         *([f"## Arrays\n\n{_table(ARRAYS_HEAD, _arrays())}"] if form.has_arrays else []),
@@ -210,13 +210,16 @@ def _splits(index: Mapping[str, Array]) -> str:
     return f"## Splits\n\n{_table(head, lines)}\n{proof}{spare}\n"
 
 
-def _rejects(rejects: Mapping[str, Mapping[str, int]]) -> str:
+def _rejects(rejects: Mapping[str, Mapping[str, int]], missing: Sequence[Mapping[str, Any]]) -> str:
     words = {
         "attempts": "scenes given up (another was drawn instead)",
         "demos": "demos left out",
         "goals": "candidate goals that did not hold (kept in `rejected_goals/`)",
     }
     lines = [(words[what], reason, count) for what, counts in rejects.items() for reason, count in counts.items()]
+    for entry in missing:
+        start, stop = entry["demo_range"]
+        lines.append((f"demos {start} to {stop - 1}, which could not be made", entry["reason"].replace("|", "/"), stop - start))
     return "## What was rejected\n\n" + (_table(["what", "reason", "count"], lines) if lines else "Nothing.\n")
 
 

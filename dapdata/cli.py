@@ -64,7 +64,33 @@ Workers = Annotated[
     _option("--workers", help="Processes that work at the same time", default="one for each core", min=1, metavar="W"),
 ]
 Engine = Annotated[
-    str, typer.Option("--engine", help="Where they work: local, or inline: in this process, one after the other.")
+    str,
+    typer.Option(
+        "--engine",
+        help="Where they work: local; ray, or ray://HOST:PORT, on a Ray cluster; inline: in this process, one after the other.",
+    ),
+]
+Memory = Annotated[
+    float | None,
+    _option(
+        "--memory",
+        help="Memory that each of them may take; a unit that takes more has failed",
+        default="an equal part of 80 % of what there is",
+        min=0.1,
+        metavar="GB",
+    ),
+]
+Units = Annotated[
+    str | None,
+    _option(
+        "--units",
+        help="Make every N-th unit, from the I-th on (from 0); other tasks make the others at the same time",
+        default="all units",
+        metavar="I/N",
+    ),
+]
+AllowMissing = Annotated[
+    bool, typer.Option("--allow-missing", help="Publish the others when units have failed; the manifest names what is missing.")
 ]
 Device = Annotated[str, typer.Option("--device", help="auto, cpu, cuda or cuda:N.")]
 Minutes = Annotated[
@@ -184,6 +210,9 @@ def generate(
     demos: Demos = None,
     workers: Workers = None,
     engine: Engine = "local",
+    memory: Memory = None,
+    units: Units = None,
+    allow_missing: AllowMissing = False,
     overrides: Overrides = None,
     dry_run: DryRun = False,
     fresh: Fresh = False,
@@ -197,13 +226,16 @@ def generate(
         made = pipeline.generate(
             asked,
             out,
-            workers=_count(workers),
+            workers=workers,
             engine=engine,
+            memory=memory,
+            units=units,
+            allow_missing=allow_missing,
             fresh=fresh,
             dry_run=dry_run,
             progress=None if dry_run else advance,
         )
-    _show_made(made, as_json)
+    _show_made(made, as_json, units)
 
 
 @app.command(epilog="Example: dapdata label data/can_cabinet --set label.eps_place=0.02")
@@ -211,6 +243,9 @@ def label(
     dataset: LastDataset = None,
     workers: Workers = None,
     engine: Engine = "local",
+    memory: Memory = None,
+    units: Units = None,
+    allow_missing: AllowMissing = False,
     overrides: Overrides = None,
     dry_run: DryRun = False,
     as_json: Json = False,
@@ -223,14 +258,43 @@ def label(
         made = pipeline.label(
             folder,
             overrides or (),
-            workers=_count(workers),
+            workers=workers,
             engine=engine,
+            memory=memory,
+            units=units,
+            allow_missing=allow_missing,
             dry_run=dry_run,
             progress=None if dry_run else advance,
         )
-    if isinstance(made, Path):
+    if isinstance(made, Path) and units is None:  # pictures need the dataset's lock, which tasks share
         _draw_previews(made)
-    _show_made(made, as_json)
+    _show_made(made, as_json, units)
+
+
+@app.command(epilog="Example: dapdata slurm recipes/can_cabinet.yaml --tasks 20 > can_cabinet.sh; bash can_cabinet.sh")
+def slurm(
+    recipe: RecipeFile,
+    out: Out = None,
+    demos: Demos = None,
+    tasks: Annotated[
+        int | None,
+        _option("--tasks", help="Most tasks of an array job", default="100, or one for each unit", min=1, metavar="N"),
+    ] = None,
+    workers: Annotated[int, typer.Option("--workers", help="Cores and processes of each task.", min=1, metavar="W")] = 1,
+    memory: Annotated[float, typer.Option("--memory", help="Memory of each process.", min=0.5, metavar="GB")] = 2.0,
+    time: Annotated[str, typer.Option("--time", help="Time limit of each task.", metavar="HH:MM:SS")] = "04:00:00",
+    partition: Annotated[str | None, _option("--partition", help="Partition", default="the cluster's", metavar="P")] = None,
+    account: Annotated[str | None, _option("--account", help="Account", default="yours", metavar="A")] = None,
+    overrides: Overrides = None,
+    allow_missing: AllowMissing = False,
+) -> None:
+    """Print a script that submits generate and label to Slurm as array jobs. Nothing is submitted by this command."""
+    from dapdata.slurm import Limits, script
+
+    asked = _recipe(recipe, overrides, demos)
+    changes = [*(overrides or ()), *([f"demos={demos}"] if demos is not None else [])]
+    limits = Limits(tasks, workers, memory, time, partition, account)
+    print(script(asked, recipe, out, changes, limits, allow_missing), end="")
 
 
 @app.command(epilog="Example: dapdata status data/can_cabinet --json")
@@ -489,6 +553,8 @@ def run(
     k: K = None,
     workers: Workers = None,
     engine: Engine = "local",
+    memory: Memory = None,
+    allow_missing: AllowMissing = False,
     device: Device = "auto",
     overrides: Overrides = None,
     fresh: Fresh = False,
@@ -497,7 +563,7 @@ def run(
     """Generate, label, train and eval. Then say how well it went and where everything is."""
     from dapdata import pipeline
 
-    _need("sim", "pybullet", "numba", "pebble", "matplotlib")
+    _need("sim", "pybullet", "numba", "matplotlib")
     _need("train", "torch")
     from daptrain import evaluate as evaluate_run
     from daptrain import train as train_networks
@@ -505,10 +571,11 @@ def run(
 
     check_budget(minutes, None)
     asked = _recipe(recipe, overrides, demos)
+    means: dict[str, Any] = {"workers": workers, "engine": engine, "memory": memory, "allow_missing": allow_missing}
     with progress("generate", "demo") as advance:
-        dataset = _folder(pipeline.generate(asked, out, workers=_count(workers), engine=engine, fresh=fresh, progress=advance))
+        dataset = _folder(pipeline.generate(asked, out, fresh=fresh, progress=advance, **means))
     with progress("label", "demo") as advance:
-        pipeline.label(dataset, workers=_count(workers), engine=engine, progress=advance)
+        pipeline.label(dataset, progress=advance, **means)
     _draw_previews(dataset)
     remember(dataset=dataset)
     target = run_folder or Path("runs") / dataset.resolve().name
@@ -703,10 +770,11 @@ def _draw_previews(dataset: Path) -> None:
         pipeline.attach(dataset, preview(dataset))
 
 
-def _show_made(made: Any, as_json: bool) -> None:
+def _show_made(made: Any, as_json: bool, units: str | None) -> None:
     """Shows the dataset's folder, or the plan."""
     if isinstance(made, Path):
-        remember(dataset=made)
+        if units is None:
+            remember(dataset=made)
         show({"dataset": str(made)}, as_json, str(made))
     else:
         show(made.to_dict(), as_json, str(made))

@@ -16,11 +16,12 @@ import shutil
 import socket
 import sys
 import tempfile
+import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from hashlib import file_digest, sha256
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from dapdata.errors import EnvironmentProblem, LockedError
 
@@ -113,7 +114,7 @@ def commit(folder: Path, target: Path) -> bool:
 def replace_file(path: Path, data: bytes) -> None:
     """Writes a file so that its name holds either the old bytes or the new ones, also after a power cut."""
     make_folder(path.parent)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    temporary = path.with_name(f".{path.name}.{socket.gethostname()}.{os.getpid()}.tmp")
     temporary.write_bytes(data)
     move_file(temporary, path)
 
@@ -144,45 +145,81 @@ def discard(root: Path, path: Path) -> None:
 
 
 def sweep(root: Path) -> None:
-    """Removes what killed processes left in staging and half-written names; only under the lock."""
-    shutil.rmtree(root / STAGING, ignore_errors=True)
+    """Removes what killed processes left in staging and half-written names; only under a lock that nobody shares.
+
+    Staging is renamed first: a worker that has not heard yet of its command's end (on another machine it may go on for
+    some seconds) then fails, instead of committing a folder that is half swept.
+    """
+    with suppress(FileNotFoundError):
+        (root / STAGING).rename(root / f".{STAGING}.{socket.gethostname()}.{os.getpid()}.tmp")
     for leftover in [*root.glob(TEMPORARY), *root.glob(f"*/{TEMPORARY}")]:
-        leftover.unlink()
+        if leftover.is_dir():
+            shutil.rmtree(leftover, ignore_errors=True)
+        else:
+            leftover.unlink()
 
 
 @contextmanager
-def lock(root: Path) -> Iterator[None]:
-    """Holds the dataset for one writer; readers need no lock. The lock dies with its process.
+def lock(root: Path, *, shared: bool = False, patience: float = 0.0) -> Iterator[None]:
+    """Holds the dataset for one writer, or for several that share it; readers need no lock. It dies with its process.
+
+    Those who share it may commit units, which is a rename each and harmless if two make the same one. They neither
+    sweep nor publish.
+
+    Args:
+        root: The dataset's folder.
+        shared: Whether others may hold it at the same time, if they share it too.
+        patience: How long to wait for it, s.
 
     Raises:
-        LockedError: at once, if another process holds it; the message says which.
+        LockedError: if another process holds it; the message says which.
     """
     make_folder(root)
     with (root / ".lock").open("a+") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            file.seek(0)
-            holder = file.read().strip() or "another process"
-            raise LockedError(f"{root}: in use by {holder}; wait for it to end, or stop it, and run again") from error
-        file.truncate(0)
-        file.write(f"process {os.getpid()} on {socket.gethostname()} ({' '.join(sys.argv)[:200]})")
+        _flock(root, file, fcntl.LOCK_SH if shared else fcntl.LOCK_EX, time.monotonic() + patience)
+        mine = f"process {os.getpid()} on {socket.gethostname()} ({' '.join(sys.argv)[:200]})\n"
+        if not shared:
+            file.truncate(0)
+            sweep(root)
+        file.write(mine)
         file.flush()
-        sweep(root)
         try:
             yield
         finally:
-            sweep(root)
+            if not shared:
+                sweep(root)
+            file.seek(0)
+            others = file.read().replace(mine, "", 1) if shared else ""
             file.truncate(0)
+            file.write(others)
+
+
+def _flock(root: Path, file: IO[str], kind: int, deadline: float) -> None:
+    while True:
+        try:
+            fcntl.flock(file, kind | fcntl.LOCK_NB)
+            return
+        except OSError as error:
+            if error.errno not in (errno.EAGAIN, errno.EACCES):
+                raise EnvironmentProblem(
+                    f"{root}: cannot be locked ({error.strerror}), expected a file system with flock (Lustre: mounted with "
+                    "`flock`); choose another folder with --out"
+                ) from error
+            if time.monotonic() >= deadline:
+                found = holder(root) or "another process"
+                raise LockedError(f"{root}: in use by {found}; wait for it to end, or stop it, and run again") from error
+        time.sleep(0.1)
 
 
 def holder(root: Path) -> str | None:
-    """Who works on the dataset now, as it said itself; None if nobody does."""
+    """Who works on the dataset now, as it said itself; None if nobody does. Those on other machines are believed."""
     try:
-        words = (root / ".lock").read_text()
+        lines = (root / ".lock").read_text().splitlines()
     except OSError:
         return None
-    return words if words and Path("/proc", words.split()[1]).exists() else None
+    here = f" on {socket.gethostname()} ("
+    working = [line for line in lines if here not in line or Path("/proc", line.split()[1]).exists()]
+    return f"{working[0]} and {len(working) - 1} more" if len(working) > 1 else next(iter(working), None)
 
 
 @contextmanager

@@ -274,6 +274,9 @@ def _leaks(index: Index, found: Manifest) -> Iterator[str]:
 def _notes(root: Path, found: Manifest) -> Iterator[str]:
     if _is_slim(root, found):
         yield "stages/ is not here: the shards are complete in themselves, but cannot be labelled again"
+    for entry in found.missing:
+        first, last = entry.demo_range[0], entry.demo_range[1] - 1
+        yield f"demos {first} to {last} are missing: {entry.stage} failed: {entry.reason}; run generate and label to try again"
     unnamed = _unnamed(root, found)
     if unnamed:
         size = sum(_size(path) for path in unnamed)
@@ -349,6 +352,7 @@ def inspect(root: str | Path) -> Facts:
         "shards": len(found.shards),
         "splits": {name: entry.demos for name, entry in found.splits.items()},
         "rejects": found.rejects.model_dump(),
+        "missing": [f"{entry.demo_range[0]} to {entry.demo_range[1] - 1}: {entry.reason}" for entry in found.missing],
         "bytes": {"shards": manifest.total_bytes(found.shards)}
         | {name: manifest.total_bytes(stage.units) for name, stage in found.stages.items()},
         "created_by": found.created_by,

@@ -29,7 +29,7 @@ class Form:
 
     files: str  # Markdown: what is where
     loader: str  # Markdown: how to read it
-    configs: str = ""  # YAML, the value of `configs` in the header: which files the viewer shows
+    header: str = ""  # YAML: which files the hub's viewer shows
     has_arrays: bool = True  # whether the files hold the shards' arrays
 
 
@@ -50,7 +50,7 @@ xyz, score = (g[f"container_superpoints/{k}"][o[i]:o[i+1]] for k in ("points", "
 
 or, with dapdata installed, `dapdata.open(".", split="train")[0]`, and `.torch()` or `.stream()` of it for training.
 """,
-    configs="- config_name: index\n  data_files: index.parquet",
+    header="configs:\n- config_name: index\n  data_files: index.parquet",
 )
 
 FRAMES = """## Units and frames
@@ -161,7 +161,7 @@ def _header(manifest: Mapping[str, Any], index: Mapping[str, Array], form: Form)
     size = next((text for limit, text in SIZES if here < limit), "n>1M")
     lines = [f"license: {LICENSE}", "task_categories:", "- robotics", "tags:", *(f"- {tag}" for tag in TAGS)]
     lines += [f"pretty_name: {manifest['name']}", "size_categories:", f"- {size}"]
-    lines += ["configs:", form.configs] if index and form.configs else []
+    lines += [form.header] if index and form.header else []
     return "\n".join(["---", *lines, "---"])
 
 

@@ -160,6 +160,13 @@ def test_row_groups_are_cut(toy: Path, tmp_path: Path, monkeypatch: pytest.Monke
         assert max(sizes) <= 2
 
 
+def test_lists_are_nested_in_the_order_of_the_axes() -> None:
+    import pyarrow as pa
+
+    arrays = [np.arange(24.0).reshape(2, 3, 4), np.arange(12.0).reshape(1, 3, 4)]
+    assert parquet._nested(arrays, pa.list_(pa.list_(pa.list_(pa.float64())))).to_pylist() == [a.tolist() for a in arrays]
+
+
 def test_every_row_has_its_own_picture(tiny: Path, dataset: Dataset, tmp_path: Path) -> None:
     import pyarrow.parquet as pq
     from matplotlib import image
@@ -174,11 +181,7 @@ def test_every_row_has_its_own_picture(tiny: Path, dataset: Dataset, tmp_path: P
 
 
 @pytest.mark.slow
-def test_datasets_reads_every_demo_as_it_is_in_the_shards(
-    tiny: Path, dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
-    monkeypatch.setenv("HF_HOME", str(tmp_path / "cache"))
+def test_datasets_reads_every_demo_as_it_is_in_the_shards(tiny: Path, dataset: Dataset, tmp_path: Path) -> None:
     datasets = pytest.importorskip("datasets", reason="needs the extra interop: `make test-all` installs it")
     out = parquet.export(tiny, tmp_path / "out", shard_size=2)
     read = datasets.load_dataset(str(out), cache_dir=str(tmp_path / "cache"))
@@ -560,7 +563,10 @@ def test_what_is_not_labelled_or_not_there_is_said(
     assert "generated but not labelled" in said(capsys, "webdataset", raw, "--out", tmp_path / "out", code=2)
     (tmp_path / "out.partial").mkdir()
     (tmp_path / "out.partial/notes.txt").touch()
-    assert "is no unfinished export" in said(capsys, "webdataset", toy, "--out", tmp_path / "out", code=2)
+    (tmp_path / "other.partial").touch()
+    for name in ("out", "other"):
+        assert "is no unfinished export" in said(capsys, "webdataset", toy, "--out", tmp_path / name, code=2)
+    assert (tmp_path / "out.partial/notes.txt").exists()
     shard = toy_copy / manifest.read(toy_copy).shards[0].path
     (shard / "zarr.json").unlink()
     assert "run `dapdata verify" in said(capsys, "webdataset", toy_copy, "--out", tmp_path / "damaged", code=3)

@@ -204,9 +204,7 @@ def _refuse_inside(out: str | Path, target: Path, root: Path) -> None:
 
 def _is_there(out: str | Path, target: Path, about: Mapping[str, Any]) -> bool:
     """Whether the folder is this export; False if it is new or empty."""
-    if target.is_dir() and not any(target.iterdir()):
-        return False
-    if not target.exists() and not target.is_symlink():
+    if not target.exists() or (target.is_dir() and not any(target.iterdir())):
         return False
     found = _read_about(target)
     if found is None:
@@ -240,11 +238,12 @@ def _has_size(path: Path, size: int) -> bool:
 
 def _refuse_foreign(partial: Path) -> None:
     """Refuses to clear what somebody else may have put under the name of an unfinished export."""
-    ours = (".lock", durable.STAGING)
-    if partial.exists() and _read_about(partial) is None:
-        others = [path for path in partial.iterdir() if path.name not in ours and not path.match(durable.TEMPORARY)]
-        if others or not partial.is_dir():
-            raise UsageError(f"{partial}: exists and is no unfinished export, but that name is needed; move it away")
+    known = (".lock", durable.STAGING)
+    others = partial.exists() and not partial.is_dir()
+    if partial.is_dir() and _read_about(partial) is None:
+        others = any(path.name not in known and not path.match(durable.TEMPORARY) for path in partial.iterdir())
+    if others:
+        raise UsageError(f"{partial}: exists and is no unfinished export, expected that name to be free; move it away")
 
 
 def _start(partial: Path, about: Mapping[str, Any]) -> None:

@@ -36,6 +36,7 @@ def own_ray(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     with tempfile.TemporaryDirectory(prefix="r", dir="/tmp") as folder:  # Ray's sockets need a short path
         monkeypatch.delenv("RAY_ADDRESS", raising=False)
         monkeypatch.setenv("RAY_TMPDIR", folder)
+        monkeypatch.setenv("HOME", folder)  # where Ray keeps the token of the clusters that it starts
         monkeypatch.setenv("PYTHONPATH", f"{HERE}:{os.environ.get('PYTHONPATH', '')}")
         yield Path(folder) / "ray"
 
@@ -59,7 +60,7 @@ def test_a_cluster_whose_worker_is_killed_ends_with_the_content_of_a_serial_run(
 def test_a_cluster_that_cannot_be_reached_is_an_error_that_says_so(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:1")
     begin = time.monotonic()
-    with pytest.raises(EnvironmentProblem, match=r"no Ray cluster could be joined.*expected one of the same Ray and Python"):
+    with pytest.raises(EnvironmentProblem, match=r"no Ray cluster could be joined .*expected one of the same Ray and"):
         engines.get(name).run("bad_jobs:behave", [engines.Job("{}", 1)], workers=1, on_done=print)
     assert time.monotonic() - begin < 30
 
@@ -82,6 +83,7 @@ def cluster() -> Iterator[tuple[str, str]]:
     with tempfile.TemporaryDirectory(prefix="r", dir="/tmp") as folder, pytest.MonkeyPatch.context() as patch:
         patch.setenv("RAY_TMPDIR", folder)
         patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+        patch.setenv("RAY_AUTH_MODE", "disabled")  # it listens on loopback alone
         patch.setenv("PYTHONPATH", f"{HERE}:{os.environ.get('PYTHONPATH', '')}")
         options = [f"--port={port}", f"--ray-client-server-port={client}", "--num-cpus=3", "--node-ip-address=127.0.0.1"]
         command = [
@@ -162,6 +164,19 @@ def test_an_error_that_is_the_users_is_raised_and_stops_the_others(engine: str) 
     with pytest.raises(LockedError, match="in use by process 1"):
         engines.get(engine).run("bad_jobs:behave", jobs, workers=2, on_done=print)
     assert time.monotonic() - begin < 200
+
+
+@pytest.mark.slow
+def test_a_node_without_dapdata_is_an_error_that_says_so(engine: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    import dapdata.engines.on_ray as here
+
+    monkeypatch.setattr(here._attempt, "__module__", "not_installed_there")
+    monkeypatch.setitem(sys.modules, "not_installed_there", here)
+    with pytest.raises(
+        EnvironmentProblem,
+        match=r"cannot work \(.*No module named 'not_installed_there'\), expected the same Python and dapdata",
+    ):
+        engines.get(engine).run("bad_jobs:behave", [engines.Job("{}", 10)], workers=1, on_done=print)
 
 
 @pytest.mark.slow

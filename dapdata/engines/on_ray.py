@@ -8,6 +8,7 @@ folder under the same path; units.py and pipeline.py check both.
 
 from __future__ import annotations
 
+import logging
 import os
 import socket
 from collections import deque
@@ -23,6 +24,7 @@ from dapdata.engines.child import Child, Outcome, attempt, share
 from dapdata.errors import EnvironmentProblem, require
 
 POLL = 1.0  # s between two chances for Ctrl-C
+LOCAL, RUNNING = "local", "auto"  # what Ray calls a new cluster of this machine, and the one that runs here already
 OBJECT_STORE = 100e6  # bytes of a cluster that we start: answers are a few lines
 PATIENCE = 10.0  # s in which a cluster answers; Ray itself would try for half a minute, or for ten
 
@@ -45,8 +47,8 @@ class OnRay:
                 return settle(jobs, queue.append, self._outcomes(call, jobs, queue, under_way, workers), on_done)
             except ConnectionError as error:
                 raise EnvironmentProblem(
-                    f"{self._name}: the cluster is gone ({_line(error)}), expected it to stay; what it finished is kept: start "
-                    "it and run the same command again"
+                    f"{self._name}: the cluster is gone ({_lines(error)[0]}), expected it to stay; what it finished is kept: "
+                    "start it and run the same command again"
                 ) from error
             finally:
                 for task in under_way:
@@ -60,7 +62,10 @@ class OnRay:
         while queue or under_way:
             while queue and (workers is None or len(under_way) < workers):
                 number = queue.popleft()
-                under_way[task.remote(call, *astuple(jobs[number]))] = number
+                try:
+                    under_way[task.remote(call, *astuple(jobs[number]))] = number
+                except ImportError as error:  # Ray Client, whose head node looks at the function
+                    raise self._unfit(error) from error
             done, _ = self._ray.wait(list(under_way), num_returns=1, timeout=POLL)
             for one in done:
                 yield under_way.pop(one), self._outcome(one)
@@ -68,13 +73,21 @@ class OnRay:
     def _outcome(self, task: Any) -> Outcome:
         try:
             return Outcome(*self._ray.get(task))
+        except self._ray.exceptions.RayTaskError as error:  # whatever a job does, `_attempt` itself does not fail
+            raise self._unfit(error) from error
         except self._ray.exceptions.RayError as error:
-            return Outcome(None, f"{type(error).__name__}: {_line(error)}", str(error))
+            return Outcome(None, f"{type(error).__name__}: {_lines(error)[0]}", str(error))
+
+    def _unfit(self, error: Exception) -> EnvironmentProblem:
+        return EnvironmentProblem(
+            f"{self._name}: a node cannot work ({_lines(error)[-1]}), expected the same Python and dapdata on each, with the "
+            "extra `sim`; install them there"
+        )
 
 
-def _line(error: BaseException) -> str:
-    """The first line that an error says."""
-    return (str(error).strip().splitlines() or [type(error).__name__])[0]
+def _lines(error: BaseException) -> list[str]:
+    """What an error says; at least one line."""
+    return str(error).strip().splitlines() or [type(error).__name__]
 
 
 # The cluster -----------------------------------------------------------------------------------------------
@@ -88,46 +101,48 @@ def _connected(ray: ModuleType, name: str, workers: int | None) -> Iterator[None
         return
     address = name if name.startswith(CLIENT) else _running_here()
     quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
-    try:
-        if address is None:
-            _start(ray, workers, quiet)
-        else:
-            _knock(address)
-            ray.init(address, **quiet)
-    except (OSError, RuntimeError, ValueError) as error:
-        raise EnvironmentProblem(
-            f"{address or name}: no Ray cluster could be joined or started there ({_line(error)}); "
-            "expected one of the same Ray and Python; see docs/clusters.md"
-        ) from error
+    mine = {"num_cpus": workers, "include_dashboard": False, "object_store_memory": OBJECT_STORE} if address == LOCAL else {}
+    with _settings_of_ray():
+        try:
+            if address != LOCAL and address != RUNNING:
+                _knock(address)
+            ray.init(address, **quiet, **mine)
+        except (OSError, RuntimeError, ValueError) as error:
+            raise EnvironmentProblem(
+                f"{name}: no Ray cluster could be joined or started ({_lines(error)[0]}); expected one of the same Ray and "
+                "Python, and its token if it wants one (RAY_AUTH_MODE=token)"
+            ) from error
+        try:
+            yield
+        finally:
+            ray.shutdown()
+
+
+@contextmanager
+def _settings_of_ray() -> Iterator[None]:
+    """Within this, a cluster that is started reports to nobody; after it, what Ray set for its own children is undone."""
+    names = ("RAY_USAGE_STATS_ENABLED", "RAY_AUTH_MODE")
+    before = {name: os.environ.get(name) for name in names}
+    os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
+    logging.getLogger("ray").setLevel(logging.ERROR)
     try:
         yield
     finally:
-        ray.shutdown()
+        for name, value in before.items():
+            os.environ.pop(name, None)
+            if value is not None:
+                os.environ[name] = value
 
 
-def _start(ray: ModuleType, workers: int | None, quiet: dict[str, Any]) -> None:
-    """A cluster of this machine alone, for as long as we are connected; it reports to nobody."""
-    usage = "RAY_USAGE_STATS_ENABLED"
-    before = os.environ.get(usage)
-    os.environ[usage] = "0"
-    try:
-        ray.init("local", num_cpus=workers, include_dashboard=False, object_store_memory=OBJECT_STORE, **quiet)
-    finally:
-        os.environ.pop(usage)
-        if before is not None:
-            os.environ[usage] = before
-
-
-def _running_here() -> str | None:
-    """The cluster that RAY_ADDRESS names, or else the one that `ray start` left a note of, if that still runs."""
+def _running_here() -> str:
+    """The cluster that RAY_ADDRESS names, or the one that `ray start` left a note of if that still runs, or a new one."""
     if named := os.environ.get("RAY_ADDRESS"):
         return named
     note = Path(os.environ.get("RAY_TMPDIR") or os.environ.get("TMPDIR") or "/tmp") / "ray/ray_current_cluster"
-    with suppress(OSError):
-        address = note.read_text().strip()
-        _knock(address)
-        return address
-    return None
+    with suppress(OSError, ValueError):
+        _knock(note.read_text().strip())
+        return RUNNING
+    return LOCAL
 
 
 def _knock(address: str) -> None:

@@ -49,10 +49,12 @@ def _option(*names: str, help: str, default: str = "", **more: Any) -> Any:
     return typer.Option(*names, help=words, show_default=False, **more)
 
 
-LastDataset = Annotated[Path | None, typer.Argument(help="Dataset folder; default: the last one written from here.")]
+LastDataset = Annotated[str | None, typer.Argument(help="Dataset folder or URL; default: the last one written from here.")]
 LastRun = Annotated[Path | None, typer.Argument(help="Run folder; default: the last one written from here.")]
 RecipeFile = Annotated[Path, typer.Argument(help="Recipe, such as recipes/quickstart.yaml.")]
-Out = Annotated[Path | None, _option("--out", help="Dataset folder", default="data/<recipe name>", metavar="DIR")]
+Out = Annotated[
+    str | None, _option("--out", help="Dataset folder, or s3://bucket/folder", default="data/<recipe name>", metavar="DIR")
+]
 RunFolder = Annotated[Path | None, _option("--run", help="Run folder", default="runs/<dataset name>", metavar="DIR")]
 Demos = Annotated[int | None, _option("--demos", help="Number of demos", default="the recipe's", min=1, metavar="N")]
 Overrides = Annotated[list[str] | None, _option("--set", help="Override of a recipe key; may be repeated", metavar="KEY=VALUE")]
@@ -228,7 +230,7 @@ def label(
             dry_run=dry_run,
             progress=None if dry_run else advance,
         )
-    if isinstance(made, Path):
+    if not dry_run:
         _draw_previews(made)
     _show_made(made, as_json)
 
@@ -288,7 +290,7 @@ def show_dataset(
     from dapdata.show import contact_sheet, show_html
 
     folder = last("dataset", dataset)
-    targets = [out] if out is not None else [Path(f"{folder.resolve().name}{suffix}") for suffix in (".png", ".html")]
+    targets = [out] if out is not None else [Path(f"{_name(folder)}{suffix}") for suffix in (".png", ".html")]
     if any(target.suffix not in (".png", ".html") for target in targets):
         raise UsageError(f"--out {out}: expected a .png or .html file")
     draw = {".png": contact_sheet, ".html": show_html}
@@ -312,14 +314,14 @@ def train(
     as_json: Json = False,
 ) -> None:
     """Train on the train split. Goes on where it stopped; keeps the best (held-out) and the last weights."""
-    from dapdata import manifest, recipe
+    from dapdata import loading, manifest, recipe
     from daptrain import train as train_networks
 
     folder = last("dataset", dataset)
     _train_keys(overrides)
-    about = manifest.read(folder)
-    config = recipe.from_resolved(about.recipe, overrides or (), str(folder / manifest.MANIFEST)).train
-    target = run or Path("runs") / folder.resolve().name
+    resolved = loading.open(folder).recipe
+    config = recipe.from_resolved(resolved, overrides or (), f"{folder}/{manifest.MANIFEST}").train
+    target = run or Path("runs") / _name(folder)
     train_networks(folder, target, net=net, minutes=minutes, steps=steps, device=device, config=config, method=method)
     remember(dataset=folder, run=target)
     show({"run": str(target), "dataset": str(folder)}, as_json, str(target))
@@ -328,7 +330,9 @@ def train(
 @app.command("eval", epilog="Example: dapdata eval runs/can_cabinet --trials 50 -k 8")
 def evaluate(
     run: LastRun = None,
-    data: Annotated[Path | None, _option("--data", help="Dataset folder", default="the run's own", metavar="DATASET")] = None,
+    data: Annotated[
+        str | None, _option("--data", help="Dataset folder or URL", default="the run's own", metavar="DATASET")
+    ] = None,
     split: InSplit = "test",
     trials: Trials = None,
     protocol: Rules = None,
@@ -376,7 +380,7 @@ def evaluate(
     if minutes is not None or steps is not None:
         raise UsageError("--minutes, --steps: nothing is trained without --curve; train with: dapdata train")
     if method in (None, "dap", "cap"):
-        run = last("run", run)
+        run = Path(last("run", run))
         method = method or str(read_description(run)["method"])
     elif run is not None:  # a report of another method must not replace the run's own
         out = out or run.parent / f"{method}-{run.name}"
@@ -392,7 +396,7 @@ def evaluate(
 @app.command(epilog="Example: dapdata judge mine.npz --data data/can_cabinet --out mine.json")
 def judge(
     predictions: Annotated[Path, typer.Argument(help="npz with demo, rank, T_world_object and score.")],
-    data: Annotated[Path, _option("--data", help="Dataset folder", metavar="DATASET")],
+    data: Annotated[str, _option("--data", help="Dataset folder or URL", metavar="DATASET")],
     split: InSplit = "test",
     trials: Annotated[int | None, _option("--trials", help="Demos of the split that are judged", default="all", min=1)] = None,
     protocol: Annotated[Protocol, typer.Option("--protocol", help="Rules of the judge.")] = "strict",
@@ -488,20 +492,21 @@ def run(
     check_budget(minutes, None)
     asked = _recipe(recipe, overrides, demos)
     with progress("generate", "demo") as advance:
-        dataset = _folder(pipeline.generate(asked, out, workers=_count(workers), engine=engine, fresh=fresh, progress=advance))
+        made = pipeline.generate(asked, out, workers=_count(workers), engine=engine, fresh=fresh, progress=advance)
+        dataset = str(made)
     with progress("label", "demo") as advance:
         pipeline.label(dataset, workers=_count(workers), engine=engine, progress=advance)
     _draw_previews(dataset)
     remember(dataset=dataset)
-    target = run_folder or Path("runs") / dataset.resolve().name
+    target = run_folder or Path("runs") / _name(dataset)
     if fresh and (target / "config.json").is_file():
         shutil.rmtree(target)
     train_networks(dataset, target, minutes=minutes, device=device, config=asked.train)
     remember(run=target)
     report = evaluate_run(target, dataset, trials=trials, k=k, device=device, workers=_count(workers))
     files = {"dataset": dataset, "run": target, "report": target / "report.html"} | _leave_behind(dataset, target)
-    made = {name: str(path) for name, path in files.items()}
-    show({**made, "result": report}, as_json, made_text(report, made))
+    left = {name: str(path) for name, path in files.items()}
+    show({**left, "result": report}, as_json, made_text(report, left))
 
 
 # Around ----------------------------------------------------------------------------------------------------
@@ -556,7 +561,7 @@ def _train_keys(overrides: list[str] | None) -> dict[str, Any]:
 def _evaluate_curve(
     sizes: str,
     run: Path | None,
-    data: Path | None,
+    data: str | None,
     out: Path | None,
     overrides: list[str] | None,
     method: str | None,
@@ -564,7 +569,7 @@ def _evaluate_curve(
     asked: dict[str, Any],
 ) -> None:
     """`dapdata eval --curve`; `asked` are further arguments of `daptrain.curve.curve`."""
-    from dapdata import manifest, recipe
+    from dapdata import loading, manifest, recipe
     from daptrain.checkpoint import read_description
     from daptrain.curve import curve, text
     from daptrain.evaluation import data_of
@@ -573,12 +578,12 @@ def _evaluate_curve(
     if not all(number.isdecimal() for number in numbers):
         raise UsageError(f"--curve: got '{sizes}', expected numbers of demos with commas between them, such as 10,20,40")
     description = {} if run is None else read_description(run)
-    folder = data or (last("dataset", None) if run is None else Path(data_of(run)))
+    folder = data or (last("dataset", None) if run is None else str(data_of(run)))
     _train_keys(overrides)
-    resolved = manifest.read(folder).recipe | ({"train": description["train"]} if description else {})
-    config = recipe.from_resolved(resolved, overrides or (), str(run or folder / manifest.MANIFEST)).train
+    resolved = loading.open(folder).recipe | ({"train": description["train"]} if description else {})
+    config = recipe.from_resolved(resolved, overrides or (), str(run or f"{folder}/{manifest.MANIFEST}")).train
     method = method or str(description.get("method", "dap"))
-    target = out or run or Path("runs") / f"curve-{folder.resolve().name}"
+    target = out or run or Path("runs") / f"curve-{_name(folder)}"
     found = curve(folder, target, [int(number) for number in numbers], config=config, method=method, **asked)
     remember(dataset=folder)
     show(found, as_json, f"{text(found)}\n\n{target / 'curve.html'}")
@@ -589,27 +594,27 @@ def _count(workers: int | None) -> int:
     return workers or len(os.sched_getaffinity(0))
 
 
-def _draw_previews(dataset: Path) -> None:
+def _draw_previews(dataset: Any) -> None:
     """Adds the pictures of the dataset's card, unless they are there already."""
-    from dapdata import manifest, pipeline
+    from dapdata import loading, manifest, pipeline
     from dapdata.show import preview
 
-    if not any(path.startswith(f"{manifest.PREVIEWS}/") for path in manifest.read(dataset).files):
+    if not any(path.startswith(f"{manifest.PREVIEWS}/") for path in loading.open(dataset).manifest.files):
         pipeline.attach(dataset, preview(dataset))
 
 
 def _show_made(made: Any, as_json: bool) -> None:
-    """Shows the dataset's folder, or the plan."""
-    if isinstance(made, Path):
+    """Shows the dataset's folder or URL, or the plan."""
+    if isinstance(made, str | Path):
         remember(dataset=made)
         show({"dataset": str(made)}, as_json, str(made))
     else:
         show(made.to_dict(), as_json, str(made))
 
 
-def _folder(made: Any) -> Path:
-    assert isinstance(made, Path), "only a dry run makes a plan"
-    return made
+def _name(dataset: str) -> str:
+    """The last part of a dataset's folder or URL."""
+    return Path(dataset).resolve().name
 
 
 def _show_report(report: dict[str, Any], as_json: bool) -> None:
@@ -621,7 +626,7 @@ def _show_report(report: dict[str, Any], as_json: bool) -> None:
     require_sound(Report.model_validate_json(json.dumps(report)))
 
 
-def _leave_behind(dataset: Path, run: Path) -> dict[str, Path]:
+def _leave_behind(dataset: str, run: Path) -> dict[str, Path]:
     """Pictures of the dataset, and the clouds of one held-out demo as scans to try `dapdata predict` on."""
     from dapdata.clouds import write_ply
     from dapdata.loading import open as open_dataset

@@ -4,6 +4,9 @@ Everything that is published goes through here, in this order: write in `staging
 folders from the leaves up, rename, fsync the folder that holds the new name. A reader or a crash therefore sees
 a committed folder whole or not at all. zarr writes its chunks by rename too, but never fsyncs, and reads a
 missing chunk as fill values without a word; hence a whole unit is committed at once and named by its hashes.
+
+A dataset in an object store is worked on in a copy on this machine (remote.py). What is made durable in the copy is
+repeated in the store by the copy's `Mirror`, so there is one order of steps for both.
 """
 
 from __future__ import annotations
@@ -20,7 +23,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from hashlib import file_digest, sha256
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from dapdata.errors import EnvironmentProblem, LockedError
 
@@ -30,6 +33,27 @@ FULL_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 NO_PERMISSION = (errno.EACCES, errno.EPERM, errno.EROFS)
 
 observer: Callable[[str, Path], None] | None = None  # tests set it to see, or to stop at, every fsync and rename
+
+
+class Mirror(Protocol):
+    """Repeats elsewhere what is made durable below a folder of this machine."""
+
+    def commit(self, folder: Path) -> bool:
+        """A folder was moved to its place here; False if there is another there already, which is then here too."""
+
+    def replace(self, path: Path, data: bytes) -> None:
+        """A file has new bytes."""
+
+    def remove(self, path: Path) -> None:
+        """A file or a folder is to go."""
+
+
+mirrors: dict[Path, Mirror] = {}  # by folder; empty unless a dataset in an object store is worked on
+
+
+def mirror_of(path: Path) -> Mirror | None:
+    """The mirror of the working copy that a path is in."""
+    return next((mirror for root, mirror in mirrors.items() if path.is_relative_to(root)), None)
 
 
 def _note(action: str, path: Path) -> None:
@@ -88,7 +112,7 @@ def staged(root: Path, name: str) -> Iterator[Path]:
 
 
 def commit(folder: Path, target: Path) -> bool:
-    """Moves a staged folder to its place for good; False if there is something already (then nothing is moved)."""
+    """Moves a staged folder to its place for good; False if there is something already, which is left as it is."""
     for path, _, files in os.walk(folder, topdown=False):
         for file in sorted(files):
             _fsync(Path(path, file))
@@ -102,7 +126,8 @@ def commit(folder: Path, target: Path) -> bool:
             return False
         raise
     _fsync(target.parent)
-    return True
+    mirror = mirror_of(target)
+    return mirror is None or mirror.commit(target)
 
 
 def replace_file(path: Path, data: bytes) -> None:
@@ -113,10 +138,14 @@ def replace_file(path: Path, data: bytes) -> None:
     _fsync(temporary)
     _rename(temporary, path)
     _fsync(path.parent)
+    if mirror := mirror_of(path):
+        mirror.replace(path, data)
 
 
 def remove_file(path: Path) -> None:
     """Takes a name away for good; a name that isn't there is fine."""
+    if mirror := mirror_of(path):
+        mirror.remove(path)
     if path.exists():
         _note("remove", path)
         path.unlink()
@@ -125,6 +154,8 @@ def remove_file(path: Path) -> None:
 
 def discard(root: Path, path: Path) -> None:
     """Deletes a folder so that a crash leaves it whole or gone: it is renamed into staging first."""
+    if mirror := mirror_of(path):
+        mirror.remove(path)
     make_folder(root / STAGING)
     grave = Path(tempfile.mkdtemp(prefix="discarded-", dir=root / STAGING))
     _rename(path, grave / path.name)
@@ -137,6 +168,11 @@ def sweep(root: Path) -> None:
     shutil.rmtree(root / STAGING, ignore_errors=True)
     for leftover in [*root.glob(TEMPORARY), *root.glob(f"*/{TEMPORARY}")]:
         leftover.unlink()
+
+
+def this_process() -> str:
+    """How a holder of a lock is named to others."""
+    return f"process {os.getpid()} on {socket.gethostname()} ({' '.join(sys.argv)[:200]})"
 
 
 @contextmanager
@@ -155,7 +191,7 @@ def lock(root: Path) -> Iterator[None]:
             holder = file.read().strip() or "another process"
             raise LockedError(f"{root}: in use by {holder}; wait for it to end, or stop it, and run again") from error
         file.truncate(0)
-        file.write(f"process {os.getpid()} on {socket.gethostname()} ({' '.join(sys.argv)[:200]})")
+        file.write(this_process())
         file.flush()
         sweep(root)
         try:

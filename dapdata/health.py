@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from dapdata import durable, manifest, store
+from dapdata import durable, manifest, remote, store
 from dapdata.errors import CorruptionError, FormatError
 from dapdata.manifest import Manifest, UnitEntry
 from dapdata.records import Array
@@ -87,11 +87,12 @@ class Audit:
         return "\n".join([head, *(f"  {line}" for line in self.problems), *(f"  note: {line}" for line in self.notes)])
 
 
+@remote.on_copy(units=True)
 def verify(root: str | Path, *, quick: bool = False, progress: Progress | None = None) -> Audit:
     """Compares a dataset with its manifest, down to each decoded demo.
 
     Args:
-        root: The dataset's folder.
+        root: The dataset's folder or URL.
         quick: Compare files with their hashes, and leave the arrays undecoded.
         progress: Called with units done and units in all.
 
@@ -103,27 +104,22 @@ def verify(root: str | Path, *, quick: bool = False, progress: Progress | None =
     problems = list(_single_files(root, found)) + list(_extra_files(root, found))
     files, digests, rows = len(found.files), [], []
     shard_paths = {entry.path for entry in found.shards}
-    entries = {entry.path: entry for entry in _units(found)}
+    entries = {entry.path: entry for entry in manifest.units(found)}
     for done, entry in enumerate(entries.values(), 1):
-        record, damage = _unit_files(root, entry)
-        files += len(record["files"]) if record else 0
-        problems += damage
-        if entry.path in shard_paths and record and not damage:
-            rows += [(entry.path, number, row) for number, row in enumerate(record["rows"])]
-            digests += [row["sha256"] for row in record["rows"]]
-            problems += [] if quick else list(_decoded(root, entry, record))
+        with remote.filled(root / entry.path):
+            record, damage = _unit_files(root, entry)
+            files += len(record["files"]) if record else 0
+            problems += damage
+            if entry.path in shard_paths and record and not damage:
+                rows += [(entry.path, number, row) for number, row in enumerate(record["rows"])]
+                digests += [row["sha256"] for row in record["rows"]]
+                problems += [] if quick else list(_decoded(root, entry, record))
         if progress:
             progress(done, len(entries))
     if found.shards and not problems:
         problems += list(_claims(root, found, rows, digests))
     demos = 0 if quick else len(rows)
     return Audit(str(root), tuple(problems), tuple(_notes(root, found)), files, demos, found.content_sha256)
-
-
-def _units(found: Manifest) -> Iterator[UnitEntry]:
-    yield from found.shards
-    for stage in found.stages.values():
-        yield from stage.units
 
 
 def _single_files(root: Path, found: Manifest) -> Iterator[str]:
@@ -229,6 +225,7 @@ def _notes(root: Path, found: Manifest) -> Iterator[str]:
 # How far, what is inside, what may go ----------------------------------------------------------------------
 
 
+@remote.on_copy(units=True)
 def status(root: str | Path) -> Facts:
     """How far a dataset is: units made of each stage, whether a command is at work, what it cost so far."""
     root = Path(root)
@@ -251,7 +248,7 @@ def status(root: str | Path) -> Facts:
     facts = {
         "root": str(root),
         "published": published,
-        "working": durable.holder(root),
+        "working": remote.holder(root),
         "in_progress": _in_progress(root),
         "quarantined": sorted(path.name for path in root.glob("quarantine/*.json")),
         "cpu_seconds": _cpu_seconds(log),
@@ -291,6 +288,7 @@ def _in_progress(root: Path) -> dict[str, Any] | None:
     return {"demos": demos, "units": len(todo), "done": done}
 
 
+@remote.on_copy(files=(manifest.MANIFEST, manifest.INDEX))
 def inspect(root: str | Path) -> Facts:
     """What is inside: counts, statistics a demo, rejects by reason, sizes."""
     root = Path(root)
@@ -323,6 +321,7 @@ def _statistics(index: Mapping[str, Array]) -> dict[str, dict[str, float]]:
     }
 
 
+@remote.on_copy(units=True, write=True)
 def gc(root: str | Path, *, dry_run: bool = False) -> Facts:
     """Removes units that the manifest does not name: other recipes, other labellings, what killed processes left.
 
@@ -345,7 +344,7 @@ def gc(root: str | Path, *, dry_run: bool = False) -> Facts:
 
 def _unnamed(root: Path, found: Manifest) -> list[Path]:
     """Folders of units that the manifest does not name."""
-    named = {root / entry.path for entry in _units(found)}
+    named = {root / entry.path for entry in manifest.units(found)}
     return [
         path for path in sorted([*root.glob("shards/*/*"), *root.glob("stages/*/*")]) if path.is_dir() and path not in named
     ]
@@ -353,5 +352,7 @@ def _unnamed(root: Path, found: Manifest) -> list[Path]:
 
 def _size(folder: Path) -> int:
     """Bytes that deleting a folder frees: files that others are linked to free nothing."""
+    if (stored := remote.size(folder)) is not None:
+        return stored
     facts = [path.stat() for path in folder.rglob("*") if path.is_file()]
     return sum(fact.st_size for fact in facts if fact.st_nlink == 1)

@@ -15,10 +15,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dapdata import manifest, rng, store
+from dapdata import manifest, remote, rng, store
 from dapdata.errors import CorruptionError, FormatError, UsageError, hint, nearest, require
 from dapdata.manifest import Manifest
 from dapdata.records import Array
+from dapdata.remote import Place
 from dapdata.split import SPLITS
 from dapdata.store import COLUMNS, Block, Sample
 
@@ -32,7 +33,7 @@ def open(root: str | Path, split: str | None = None) -> Dataset:
     """A labelled dataset, or one split of it.
 
     Args:
-        root: The dataset's folder.
+        root: The dataset's folder, or its URL: s3://, hf://, https:// and whatever else fsspec opens.
         split: "train", "val" or "test"; None for all demos.
 
     Raises:
@@ -40,32 +41,26 @@ def open(root: str | Path, split: str | None = None) -> Dataset:
         UsageError: if there is no such split.
         CorruptionError: if the manifest and the index don't agree.
     """
-    folder = locate(root)
-    found = manifest.read(folder)
+    place = remote.locate(root)
+    with remote.working_copy(place, files=(manifest.MANIFEST, manifest.INDEX)) as folder:
+        found = manifest.read(folder)
+        index = manifest.read_index(folder) if found.shards else {}
     if not found.shards:
-        raise FormatError(f"{folder}: generated but not labelled, expected shards; run `dapdata label {folder}`")
+        raise FormatError(f"{place}: generated but not labelled, expected shards; run `dapdata label {place}`")
     known = list(found.splits)
     if split is not None and split not in known:
         raise UsageError(f"split: got '{split}', expected one of {', '.join(SPLITS)}{hint(split, list(SPLITS))}")
-    index = manifest.read_index(folder)
     if len(index["demo"]) != sum(shard.demos for shard in found.shards):
-        raise CorruptionError(f"{folder}: index.parquet and manifest.json name different demos; run `dapdata verify {folder}`")
+        raise CorruptionError(f"{place}: index.parquet and manifest.json name different demos; run `dapdata verify {place}`")
     chosen = np.arange(len(index["demo"])) if split is None else np.flatnonzero(index["split"] == split)
-    return Dataset(folder, split, found, {name: column[chosen] for name, column in index.items()})
-
-
-def locate(root: str | Path) -> Path:
-    """Where a dataset is on this machine: the one place that turns what a user names into a path."""
-    if "://" in str(root):
-        raise FormatError(f"{root}: a URL, expected a folder on this machine; copy the dataset here first")
-    return Path(root)
+    return Dataset(place, split, found, {name: column[chosen] for name, column in index.items()})
 
 
 @dataclass
 class Dataset:
     """The demos of a dataset, or of one split of it, in demo order."""
 
-    root: Path
+    root: Place  # folder or URL
     split: str | None
     manifest: Manifest = field(repr=False)
     index: Mapping[str, Array] = field(repr=False)  # columns of index.parquet, for these demos
@@ -108,12 +103,12 @@ class Dataset:
         Raises:
             CorruptionError: if it isn't what was written.
         """
-        folder = self.root / shard
-        if not store.is_committed(folder):
-            raise CorruptionError(
-                f"{folder}: missing, expected a shard that the manifest names; run `dapdata verify {self.root}`"
-            )
-        return store.read_block(folder, _known_paths(paths))
+        with remote.unit(self.root, shard, _known_paths(paths)) as folder:
+            if not store.is_committed(folder):
+                raise CorruptionError(
+                    f"{folder}: missing, expected a shard that the manifest names; run `dapdata verify {self.root}`"
+                )
+            return store.read_block(folder, paths)
 
     def torch(self, paths: Sequence[str] | None = None) -> data.Dataset[Any]:
         """A map-style dataset of {path: tensor}, all of it in memory.

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from hashlib import sha256
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Any
@@ -94,6 +94,13 @@ class Manifest(Section):
     stages: dict[str, StageEntry] = Field(description="every stage that was run; the units of the last are the shards")
     files: dict[RelativePath, Sha256] = Field(description="every other file that belongs to the dataset")
     created_by: dict[str, str] = Field(description="versions of the packages that wrote it")
+
+
+def units(found: Manifest) -> Iterator[UnitEntry]:
+    """Every unit that a manifest names; the shards come twice, as units of their stage too."""
+    yield from found.shards
+    for stage in found.stages.values():
+        yield from stage.units
 
 
 def read(root: Path) -> Manifest:

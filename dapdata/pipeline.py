@@ -14,18 +14,19 @@ import json
 import shutil
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from dapdata import durable, engines, manifest, recipe, tasks, units
+from dapdata import durable, engines, manifest, recipe, remote, tasks, units
 from dapdata.engines import Failure, Job
 from dapdata.errors import EnvironmentProblem, FormatError, QuarantineError, UsageError, require
 from dapdata.plan import Before, Cost, Plan, before, make_plan, measured_cost, missing
 from dapdata.recipe import Recipe
 from dapdata.records import Cloud, Demo, Labels, Rejected, Superpoints
+from dapdata.remote import Place
 from dapdata.stages import Draw, Inputs, Layout, Sections, Spec, Stage, Unit, specs
 from dapdata.stages import units as units_of
 
@@ -80,7 +81,7 @@ Progress = Callable[[int, int], None]  # demos done, demos in all
 
 def generate(
     recipe_or_path: Recipe | str | Path,
-    out: str | Path | None = None,
+    out: Place | None = None,
     *,
     workers: int = 1,
     engine: str = "local",
@@ -88,12 +89,12 @@ def generate(
     dry_run: bool = False,
     progress: Progress | None = None,
     table: str = __name__,
-) -> Path | Plan:
+) -> Place | Plan:
     """Makes scenes, settled demonstrations and point clouds; goes on where an earlier call stopped.
 
     Args:
         recipe_or_path: What to make.
-        out: The dataset's folder; `data/<recipe name>` by default.
+        out: The dataset's folder, or the URL of one in a bucket; `data/<recipe name>` by default.
         workers: Processes.
         engine: Where they work, see engines.py.
         fresh: Whether to delete what is there first.
@@ -102,17 +103,18 @@ def generate(
         table: Module with STAGES and parse; tests put toys here.
 
     Returns:
-        The dataset's folder, or the Plan.
+        The dataset's folder or URL, or the Plan.
     """
     given = recipe_or_path if not isinstance(recipe_or_path, (str, Path)) else recipe.load(recipe_or_path)
-    root, stages = Path(out) if out else Path("data") / given.name, import_module(table).STAGES
+    place, stages = remote.locate(out or Path("data") / given.name), import_module(table).STAGES
     resolved = recipe.resolve(given)
-    command = _Command(root, table, stages, GENERATE, given, resolved, specs(stages, resolved))
-    return command.plan(fresh) if dry_run else command.run(workers, engine, fresh, progress)
+    with remote.working_copy(place, units=True, write=not dry_run) as root:
+        command = _Command(place, root, table, stages, GENERATE, given, resolved, specs(stages, resolved))
+        return command.plan(fresh) if dry_run else command.run(workers, engine, fresh, progress)
 
 
 def label(
-    dataset: str | Path,
+    dataset: Place,
     overrides: Sequence[str] = (),
     *,
     workers: int = 1,
@@ -120,33 +122,35 @@ def label(
     dry_run: bool = False,
     progress: Progress | None = None,
     table: str = __name__,
-) -> Path | Plan:
+) -> Place | Plan:
     """Makes superpoints, affordance and correspondence of a generated dataset, and its shards. Never simulates.
 
     Args:
-        dataset: The dataset's folder.
+        dataset: The dataset's folder or URL.
         overrides: Such as "label.eps_place=0.02"; only sections that the stages from `cluster` on read.
         workers: See generate, as the others.
 
     Raises:
         UsageError: for an override of what earlier stages read.
     """
-    root, stages = Path(dataset), import_module(table).STAGES
-    found = manifest.read(root)
-    given = import_module(table).parse(found.recipe, overrides, str(root / manifest.MANIFEST))
-    resolved = recipe.resolve(given)
-    made = {name: entry.spec for name, entry in found.stages.items() if name in GENERATE and entry.units}
-    if made.keys() != set(GENERATE):
-        raise FormatError(f"{root}: stages {sorted(made)}, expected {', '.join(GENERATE)}; run `dapdata generate` first")
-    _refuse_upstream(found.recipe, resolved, made)
-    command = _Command(root, table, stages, LABEL, given, resolved, specs(stages, resolved) | made)
-    return command.plan(False) if dry_run else command.run(workers, engine, False, progress)
+    place, stages = remote.locate(dataset), import_module(table).STAGES
+    with remote.working_copy(place, units=True, write=not dry_run) as root:
+        found = manifest.read(root)
+        given = import_module(table).parse(found.recipe, overrides, str(root / manifest.MANIFEST))
+        resolved = recipe.resolve(given)
+        made = {name: entry.spec for name, entry in found.stages.items() if name in GENERATE and entry.units}
+        if made.keys() != set(GENERATE):
+            raise FormatError(f"{root}: stages {sorted(made)}, expected {', '.join(GENERATE)}; run `dapdata generate` first")
+        _refuse_upstream(found.recipe, resolved, made)
+        command = _Command(place, root, table, stages, LABEL, given, resolved, specs(stages, resolved) | made)
+        return command.plan(False) if dry_run else command.run(workers, engine, False, progress)
 
 
+@remote.on_copy(write=True)
 def attach(dataset: str | Path, pictures: Mapping[str, bytes]) -> None:
     """Adds pictures, by their path such as "preview/goals.png", to a labelled dataset, its manifest and its card."""
     root = Path(dataset)
-    with durable.disk_problems(root), durable.lock(root):
+    with durable.disk_problems(remote.scratch_of(root)), durable.lock(root):
         units.attach(root, pictures)
 
 
@@ -164,7 +168,8 @@ def _refuse_upstream(old: Mapping[str, Any], new: Mapping[str, Any], made: Mappi
 class _Command:
     """Some stages of one dataset, to be planned or run."""
 
-    root: Path
+    place: Place  # as the user names it
+    root: Path  # the same, or its working copy
     table: str
     stages: Sequence[Stage]
     wanted: Sequence[str]
@@ -186,14 +191,15 @@ class _Command:
         mine = [stage for stage in self.stages if stage.name in self.wanted]
         previous: Before | None = None if fresh else before(self.root)
         cost = measured_cost(self.root, REFERENCE_COST)
-        return make_plan(self.layout, mine, self.units, self.resolved, previous, cost, fresh)
+        plan = make_plan(self.layout, mine, self.units, self.resolved, previous, cost, fresh)
+        return replace(plan, root=str(self.place))
 
-    def run(self, workers: int, engine: str, fresh: bool, progress: Progress | None) -> Path:
+    def run(self, workers: int, engine: str, fresh: bool, progress: Progress | None) -> Place:
         """Makes the missing units and publishes what is there then."""
         _check_packages(stage for stage in self.stages if stage.name in self.wanted)
         found, needed = engines.get(engine), int(self.plan(fresh).gigabytes * 1e9)
         _check_space(self.root, needed)
-        with durable.disk_problems(self.root, needed), durable.lock(self.root):
+        with durable.disk_problems(remote.scratch_of(self.root), needed), durable.lock(self.root):
             if fresh:
                 _clear(self.root)
             jobs = self._jobs(needed)
@@ -205,12 +211,14 @@ class _Command:
                     "shard_stage": self.layout.shard_stage,
                 }
                 durable.replace_file(self.root / manifest.PROGRESS, json.dumps(left).encode())  # specs stay in their order
-                shutil.rmtree(self.root / QUARANTINE, ignore_errors=True)
+                if (self.root / QUARANTINE).is_dir():
+                    durable.discard(self.root, self.root / QUARANTINE)
                 try:
                     self._work(found, jobs, workers, progress)
                 except UsageError:
                     _leave_nothing(self.root)
                     raise
+            remote.refresh(self.root)
             now = units.publish(self.layout, self.stages, self.resolved, self.recipe.split, self.units)
         if sum(now.rejects.demos.values()) >= now.demos:
             reasons = ", ".join(f"{reason} {count}" for reason, count in now.rejects.demos.items())
@@ -218,7 +226,7 @@ class _Command:
                 f"{self.root}: all {now.demos} demos were rejected ({reasons}), expected some that are not; "
                 "change cameras, noise or superpoints in the recipe"
             )
-        return self.root
+        return self.place
 
     def _jobs(self, needed: int) -> dict[str, Unit]:
         """The units of which something is missing, by their job."""
@@ -227,7 +235,7 @@ class _Command:
 
     def _job(self, unit: Unit, needed: int) -> str:
         place, stages = (unit.index, unit.start, unit.stop), tuple(self.wanted)
-        return units.Work(str(self.root), self.table, self.resolved, self.specs, place, stages, needed).to_json()
+        return units.Work(str(self.place), self.table, self.resolved, self.specs, place, stages, needed).to_json()
 
     def _work(self, engine: engines.Engine, jobs: Mapping[str, Unit], workers: int, progress: Progress | None) -> None:
         """Has the jobs done; those that could not be are kept apart with what is needed to replay them."""
@@ -298,6 +306,8 @@ def _check_packages(stages: Iterable[Stage]) -> None:
 
 def _check_space(root: Path, needed: int) -> None:
     """Stops before work begins if the estimate cannot fit."""
+    if durable.mirror_of(root):
+        return  # of a dataset in a store, no more than a unit a worker is on this machine
     free = shutil.disk_usage(durable.existing(root)).free
     if needed > free:
         raise EnvironmentProblem(
@@ -319,12 +329,15 @@ def _clear(root: Path) -> None:
 def _leave_nothing(root: Path) -> None:
     """Removes a folder in which no unit was finished: a recipe that admits no demo leaves no trace."""
     if not any(path.name != ".lock" and path.name != manifest.PROGRESS for path in root.iterdir()):
+        durable.remove_file(root / manifest.PROGRESS)
         shutil.rmtree(root)
 
 
 def replay(path: str) -> None:
     """Runs a quarantined unit in this process, where a debugger sees it."""
-    story = json.loads(Path(path).read_bytes())
+    folder, _, name = path.rpartition("/")
+    with remote.working_copy(folder, files=(name,)) as root:
+        story = json.loads((root / name).read_bytes())
     print(engines.answer(units.run_unit(json.dumps(story["work"]))))
 
 

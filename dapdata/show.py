@@ -11,21 +11,20 @@ from pathlib import Path
 
 import numpy as np
 
-from dapdata import errors, manifest
+from dapdata import errors, loading
 from dapdata.pictures import Shown, panels, png, sheet
+from dapdata.remote import Place
 from dapdata.viewer import page
 
 STATISTICS_DEMOS = 300  # statistics in the HTML are taken over at most this many demos, spread evenly
 
 
-def choose(dataset: Path, demos: Sequence[int] | None = None, count: int = 4) -> list[Shown]:
+def choose(dataset: Place, demos: Sequence[int] | None = None, count: int = 4) -> list[Shown]:
     """Some demos of a dataset: those asked for by their number, or `count` of them spread over it evenly.
 
     Raises:
         UsageError: a demo that the dataset does not have.
     """
-    from dapdata import loading
-
     found = loading.open(dataset)
     numbers = {int(demo): i for i, demo in enumerate(found.index["demo"])}
     if demos is None:
@@ -41,24 +40,24 @@ def choose(dataset: Path, demos: Sequence[int] | None = None, count: int = 4) ->
     return [Shown(found[i], str(found.index["task"][i]), str(found.index["split"][i])) for i in wanted]
 
 
-def contact_sheet(dataset: Path, out: Path | None = None, demos: Sequence[int] | None = None, count: int = 4) -> Path:
+def contact_sheet(dataset: Place, out: Path | None = None, demos: Sequence[int] | None = None, count: int = 4) -> Path:
     """Writes a contact sheet of a dataset and returns its path (default: `<dataset's name>.png` here).
 
     Args:
-        dataset: A dataset folder.
+        dataset: A dataset's folder or URL.
         out: The PNG to write.
         demos: Numbers of the demos to show; default: `count` of them, spread evenly over the splits.
         count: How many, when `demos` is not given.
     """
-    about = manifest.read(Path(dataset))
+    about = loading.open(dataset).manifest
     out = out or Path(f"{about.name}.png")
-    picture = sheet(choose(Path(dataset), demos, count), about.name)
+    picture = sheet(choose(dataset, demos, count), about.name)
     out.parent.mkdir(parents=True, exist_ok=True)
     out.write_bytes(picture)
     return out
 
 
-def preview(dataset: Path) -> dict[str, bytes]:
+def preview(dataset: Place) -> dict[str, bytes]:
     """The two small pictures (PNG) of a dataset's card by their path in the dataset, made from its first demo."""
     sample = choose(dataset, count=1)[0].sample
     pictures = panels(sample, float(sample["container/points"][:, 2].max()))
@@ -68,14 +67,14 @@ def preview(dataset: Path) -> dict[str, bytes]:
     }
 
 
-def show_html(dataset: Path, out: Path | None = None, demos: Sequence[int] | None = None, count: int = 4) -> Path:
+def show_html(dataset: Place, out: Path | None = None, demos: Sequence[int] | None = None, count: int = 4) -> Path:
     """Writes one self-contained HTML page about a dataset and returns its path (default: `<dataset's name>.html` here).
 
     Arguments as in `contact_sheet`. The page loads nothing from a network.
     """
-    about = manifest.read(Path(dataset))
+    about = loading.open(dataset).manifest
     out = out or Path(f"{about.name}.html")
-    shown, others = choose(Path(dataset), demos, count), choose(Path(dataset), count=STATISTICS_DEMOS)
+    shown, others = choose(dataset, demos, count), choose(dataset, count=STATISTICS_DEMOS)
     text = page(about, shown, others, sheet(shown, about.name))
     out.parent.mkdir(parents=True, exist_ok=True)
     out.write_text(text, encoding="utf-8")

@@ -20,11 +20,12 @@ DAPTRAIN = sorted((ROOT / "train/daptrain").rglob("*.py"))
 LINES = (
     ("errors", "rng", "poses", "config"),
     ("records", "strict_yaml", "durable", "clouds", "console"),
-    ("solids", "meshes", "keys", "slic", "split", "matching"),
+    ("solids", "meshes", "keys", "slic", "split", "matching", "buckets"),
     ("tabletop",),
     ("tasks",),
     ("simulate", "observe", "cluster", "labels"),
     ("recipe", "store", "stages", "engines", "manifest", "card", "report", "predictions"),
+    ("remote",),
     ("plan", "units"),
     ("pipeline",),
     ("loading", "draw", "schemas"),
@@ -37,7 +38,7 @@ LINES = (
 LINE = {module: number for number, modules in enumerate(LINES) for module in modules}
 DOMAIN = frozenset(("solids", "meshes", "tabletop", "tasks", "simulate", "observe", "cluster", "labels"))
 MUST_NOT_KNOW = {
-    **dict.fromkeys(("store", "stages", "engines", "manifest"), DOMAIN),
+    **dict.fromkeys(("store", "stages", "engines", "manifest", "buckets", "remote"), DOMAIN),
     **dict.fromkeys(("loading", "metrics", "card", "show"), frozenset(("pipeline", "engines", "tasks"))),
 }
 DAPTRAIN_MAY_KNOW = {
@@ -55,8 +56,24 @@ DOORS = {
     "pebble": {"engines"},
     "torch": {"loading", "daptrain"},
     "yaml": {"strict_yaml"},
+    "fsspec": {"buckets"},
+    "s3fs": {"buckets"},
 }
-HEAVY = ("pybullet", "numba", "open3d", "trimesh", "torch", "scipy", "matplotlib", "zarr", "pyarrow", "pandas", "rich")
+HEAVY = (
+    "pybullet",
+    "numba",
+    "open3d",
+    "trimesh",
+    "torch",
+    "scipy",
+    "matplotlib",
+    "zarr",
+    "pyarrow",
+    "pandas",
+    "rich",
+    "fsspec",
+    "s3fs",
+)
 QUATERNION_WORDS = ("quat", "getEulerFromQuaternion", "as_quat")
 
 

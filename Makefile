@@ -14,7 +14,7 @@ RECIPE ?= recipes/quickstart.yaml
 help:
 	@echo 'make demo      from a recipe to shards, two trained networks and a physics report'
 	echo 'make test      lint, types and the test suite'
-	echo 'make test-all  the same with the slow tests: whole counts, real training'
+	echo 'make test-all  the same with the slow tests: whole counts, real training, what reads exports'
 	echo 'make bench     speed and memory on this machine'
 	echo 'make check     lint and types'
 	echo 'make schemas   schemas/*.json and the generated pages of docs/'
@@ -44,7 +44,8 @@ test: check
 	@$(PYTHON) -m pytest -n 2 -m 'not slow'
 
 test-all: check
-	@$(PYTHON) -m pytest -n 2
+	@$(PYTHON) -m pip install -qq -c constraints.txt 'dapdata[interop]' # what reads exports; dapdata itself is there already
+	$(PYTHON) -m pytest -n 2
 
 bench: env
 	@$(PYTHON) -m dapdata bench

@@ -19,7 +19,6 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any, TypeVar
 
-from dapdata.durable import FULL_DISK
 from dapdata.errors import DapdataError, EnvironmentProblem, MissingExtraError, UsageError, require
 
 AT_ONCE = 16  # requests under way at the same time
@@ -178,8 +177,6 @@ class Folder:
             except Exception as error:
                 if isinstance(error, FileNotFoundError) and _code(error) != "NoSuchBucket":
                     raise
-                if isinstance(error, OSError) and error.errno in FULL_DISK:  # of this machine
-                    raise
                 if not _may_pass(error) or time.monotonic() + pause > until:
                     raise _problem(self.url, error) from error
                 log.warning("%s: %s; trying again", self.url, _words(error))
@@ -222,6 +219,8 @@ def _filesystem(url: str) -> tuple[Any, str]:
         raise MissingExtraError(f"{url}: {error}, expected the package that reads {protocol}://; install it") from error
     except ValueError as error:
         raise UsageError(f"{url}: {error}, expected a folder or a URL such as s3://bucket/folder") from error
+    if protocol in S3:
+        fs.retries = 1  # botocore repeats, and so does _ask: a third time between them only makes it slow to give up
     return fs, str(path)
 
 

@@ -1,141 +1,263 @@
-"""The dataset's card: a README.md that a stranger reads first, with the header that Hugging Face reads."""
+"""The dataset's card: a README.md that a stranger reads first, with the header that Hugging Face reads.
+
+It holds nothing that does not follow from the manifest and the index, so the same dataset has the same card. Exports
+carry the same card with what is particular to their files, a `Form`.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import json
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
-from dapdata.records import columns
+import numpy as np
 
-HEADER = """---
-license: {license}
-task_categories:
-- robotics
-tags:
-- point-cloud
-- object-placement
-- superpoints
-- affordance
-pretty_name: {name}
-size_categories:
-- {size}
-configs:
-- config_name: index
-  data_files: index.parquet
----
-"""
+from dapdata.records import Array, columns, is_ragged
+from dapdata.split import SPLITS, UNUSED
+
 LICENSE = "cc0-1.0"  # synthetic geometry, nobody's work: the data may be used for anything
+LICENSE_URL = "https://creativecommons.org/publicdomain/zero/1.0/"
+TAGS = ("dapdata", "synthetic", "point-cloud", "object-placement", "superpoints", "affordance")
 SIZES = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"), (1_000_000, "100K<n<1M"))
+COUNTS = ("goals", "container_points", "object_points", "superpoints", "positives", "correspondences")
 
-LOADER = """```python
+
+@dataclass(frozen=True)
+class Form:
+    """What a card says of the files beside it; the rest is the same for shards and for exports."""
+
+    files: str  # Markdown: what is where
+    loader: str  # Markdown: how to read it
+    configs: str = ""  # YAML, the value of `configs` in the header: which files the viewer shows
+    has_arrays: bool = True  # whether the files hold the shards' arrays
+
+
+SHARDS = Form(
+    files=(
+        "Each shard, named by `manifest.json`, is a Zarr v3 group. Ragged arrays hold the rows of all demos one after another; "
+        "demo `d` is rows `offsets[d]` to `offsets[d + 1]` of its group. `index.parquet` has one row per demo."
+    ),
+    loader="""With zarr and numpy alone:
+
+```python
 import json, zarr
-root = "."  # this folder
-path = json.load(open(f"{root}/manifest.json"))["shards"][0]["path"]
-g = zarr.open_group(f"{root}/{path}", mode="r")
+path = json.load(open("manifest.json"))["shards"][0]["path"]
+g = zarr.open_group(path, mode="r")
 o, i = g["container_superpoints/offsets"][:], 0
 xyz, score = (g[f"container_superpoints/{k}"][o[i]:o[i+1]] for k in ("points", "affordance"))
 ```
 
 or, with dapdata installed, `dapdata.open(".", split="train")[0]`, and `.torch()` or `.stream()` of it for training.
+""",
+    configs="- config_name: index\n  data_files: index.parquet",
+)
+
+FRAMES = """## Units and frames
+
+- Metres, radians, kilograms, seconds. Poses are 4x4 matrices, float64; clouds are float32.
+- `T_a_b` maps b-coordinates to a: `p_a = T_a_b @ p_b`.
+- World: right-handed, z up, z = 0 on the table top. Clouds are in the world frame, as observed.
+- Container: z up, origin at the centre of its footprint, on the underside. Object: origin at the centre of its bounding
+  box, z up at a goal. Cameras: OpenCV axes (x right, y down, z ahead).
 """
 
+LIMITS = """## Limits
 
-def render(manifest: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], previews: Sequence[str]) -> str:
+- Everything is synthetic: scenes are drawn from the ranges of a recipe and consist of ideal solids without texture, and
+  depth noise is modelled, not recorded. How far a method trained on it carries over to real scans is not shown by the
+  data itself.
+- Containers and what stands in them do not move; there is one object, and no gripper or arm.
+- The labels belong to the demonstrated goal, which is one of several; the others are in `goals/`.
+"""
+
+DAP = """@article{chang2024dap,
+  title   = {{DAP}: Diffusion-based Affordance Prediction for Multi-modality Storage},
+  author  = {Chang, Haonan and Boyalakuntla, Kowndinya and Liu, Yuhan and Zhang, Xinyu and Schramm, Liam and
+             Boularias, Abdeslam},
+  journal = {arXiv preprint arXiv:2409.00499},
+  year    = {2024}
+}"""
+
+
+def render(
+    manifest: Mapping[str, Any],
+    stages: Mapping[str, Mapping[str, Any]],
+    demos: int,
+    index: Mapping[str, Array],
+    previews: Sequence[str],
+    form: Form = SHARDS,
+) -> str:
     """The card as Markdown.
 
     Args:
-        manifest: As JSON data.
-        rows: Of the index; empty before the dataset is labelled.
+        manifest: As JSON data; its shards and stages are not looked at.
+        stages: The spec of each stage whose units are there.
+        demos: How many are in the shards; 0 before the dataset is labelled.
+        index: Its columns, of the demos that are beside the card; empty before the dataset is labelled.
         previews: Paths of pictures.
+        form: What is particular to the files.
     """
-    size = next((text for limit, text in SIZES if len(rows) < limit), "n>1M")
     parts = [
-        HEADER.format(license=LICENSE, name=manifest["name"], size=size) + f"# {manifest['name']}\n",
-        _what(manifest, rows),
-        "\n".join(f"![{path}]({path})" for path in previews),
-        _splits(manifest),
+        _header(manifest, index, form),
+        f"# {manifest['name']}\n\n{summary(manifest, demos, index)}\n",
+        "".join(f"![{_alt(path)}]({path})\n" for path in previews),
+        *([f"## Read it\n\n{form.loader}", _averages(index), _splits(index)] if index else [UNLABELLED]),
         _rejects(manifest["rejects"]),
-        f"## Read it\n\n{LOADER}" if rows else "No shards yet: run `dapdata label` on this folder.\n",
-        _arrays(),
-        _how(manifest),
+        FRAMES,
+        f"## Files\n\n{form.files}\n",
+        *([f"## Arrays\n\n{_table(ARRAYS_HEAD, _arrays())}"] if form.has_arrays else []),
+        _how(manifest, stages),
+        LIMITS,
+        f"## Licence\n\n[{LICENSE}]({LICENSE_URL}): use it for anything.\n",
+        f"## Citation\n\n```bibtex\n{citation(manifest)}\n```\n\nThe labels are those of\n\n```bibtex\n{DAP}\n```\n",
     ]
     return "\n".join(part for part in parts if part)
 
 
-def _what(manifest: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> str:
-    asked = f"Demonstrations of placing an object into a container, task `{manifest['task']}`, made in simulation by dapdata"
-    if not rows:
-        return f"{asked}: {manifest['demos']} demos, not yet labelled.\n"
-    names = ("goals", "container_points", "object_points", "superpoints", "positives", "correspondences")
-    lines = [f"| {name.replace('_', ' ')} | {_mean(rows, name):.1f} |" for name in names]
-    count = f"{len(rows)} demos of {manifest['demos']} asked for, in {len(manifest['shards'])} shards"
-    return "\n".join([f"{asked}: {count}.\n", "| a demo has on average | |", "|---|---|", *lines, ""])
+UNLABELLED = "No shards yet: run `dapdata label` on this folder.\n"
 
 
-def _mean(rows: Sequence[Mapping[str, Any]], name: str) -> float:
-    return float(sum(row[name] for row in rows)) / len(rows)
-
-
-def _splits(manifest: Mapping[str, Any]) -> str:
-    if not manifest["splits"]:
-        return ""
-    lines = [
-        f"| {name} | {entry['demos']} | {len(entry['container_instances'])} | {len(entry['object_instances'])} |"
-        for name, entry in manifest["splits"].items()
-    ]
-    proof = (
-        "No container instance (digest of the geometry of container and clutter) and no object instance is in two splits; "
-        "the instances of each stand in `manifest.json`, and `dapdata verify` fails on any overlap."
+def summary(manifest: Mapping[str, Any], demos: int, index: Mapping[str, Array]) -> str:
+    """What the dataset is, in a sentence or two; arguments as in `render`."""
+    what = (
+        f"Demonstrations of placing an object into a container, task `{manifest['task']}`, made in simulation by dapdata "
+        f"{manifest['created_by']['dapdata']}"
     )
-    table = ["| split | demos | container instances | object instances |", "|---|---|---|---|"]
-    return "\n".join(["## Splits\n", *table, *lines, "", proof, ""])
+    if not index:
+        return f"{what}: {manifest['demos']} demos, not yet labelled."
+    here = len(index["demo"])
+    return (
+        f"{what}: {here if here == demos else f'{here} of {demos}'} demos, each with noisy point clouds of container and "
+        "object, superpoints, every goal that holds in physics, and the affordance and correspondence labels of the "
+        "demonstrated one."
+    )
+
+
+def citation(manifest: Mapping[str, Any]) -> str:
+    """A BibTeX entry for the dataset; who publishes it adds author and year."""
+    digest = manifest["content_sha256"]
+    return "\n".join(
+        [
+            f"@misc{{{manifest['name']}_{digest[:8]},",
+            f"  title = {{{manifest['name']}: demonstrations of the task {manifest['task']}}},",
+            f"  note  = {{Made with dapdata {manifest['created_by']['dapdata']}; content sha256 {digest}}}",
+            "}",
+        ]
+    )
+
+
+def _header(manifest: Mapping[str, Any], index: Mapping[str, Array], form: Form) -> str:
+    here = len(index["demo"]) if index else 0
+    size = next((text for limit, text in SIZES if here < limit), "n>1M")
+    lines = [f"license: {LICENSE}", "task_categories:", "- robotics", "tags:", *(f"- {tag}" for tag in TAGS)]
+    lines += [f"pretty_name: {manifest['name']}", "size_categories:", f"- {size}"]
+    lines += ["configs:", form.configs] if index and form.configs else []
+    return "\n".join(["---", *lines, "---"])
+
+
+def _alt(path: str) -> str:
+    """What a picture shows, for those who cannot see it."""
+    known = {
+        "preview/clouds.png": "A demo's container as observed, and its superpoints",
+        "preview/goals.png": "The same demo's affordance (red: place here), and all goals that hold (orange: demonstrated)",
+    }
+    return known.get(path, path)
+
+
+def _table(head: Sequence[str], lines: Iterable[Sequence[object]]) -> str:
+    """A Markdown table."""
+    rows = [head, ["---"] * len(head), *lines]
+    return "".join(f"| {' | '.join(map(str, row))} |\n" for row in rows)
+
+
+def _averages(index: Mapping[str, Array]) -> str:
+    means = [(name.replace("_", " "), f"{index[name].mean():.1f}") for name in COUNTS]
+    return "## What a demo holds\n\n" + _table(["on average", ""], means)
+
+
+def _splits(index: Mapping[str, Array]) -> str:
+    """Demos and instances of each split, and how many instances it shares with another: none, or it would be no split."""
+    owners = index["split"]
+    names = [name for name in (*SPLITS, UNUSED) if name in owners]
+    instances = [
+        {name: np.unique(index[kind][owners == name]) for name in names} for kind in ("container_instance", "object_instance")
+    ]
+
+    def shared(own: str, found: Mapping[str, Array]) -> int:
+        others = [found[name] for name in names if name not in (own, UNUSED)]
+        return len(np.intersect1d(found[own], np.concatenate([np.zeros(0, np.int64), *others])))
+
+    lines = []
+    for name in names:
+        overlap = ["-" if name == UNUSED else shared(name, found) for found in instances]
+        lines.append((name, int((owners == name).sum()), *(len(found[name]) for found in instances), *overlap))
+    head = ["split", "demos", "containers", "objects", "containers shared with another split", "objects shared"]
+    proof = (
+        "An instance is a digest of the geometry: of the container with what stands in it, and of the object. The dataset's "
+        "`index.parquet` has those of each demo, and `dapdata verify` fails if two splits share one."
+    )
+    spare = " `unused` demos share one with two splits, and so belong to neither." if UNUSED in names else ""
+    return f"## Splits\n\n{_table(head, lines)}\n{proof}{spare}\n"
 
 
 def _rejects(rejects: Mapping[str, Mapping[str, int]]) -> str:
     words = {
         "attempts": "scenes given up (another was drawn instead)",
-        "demos": "demos left out of the shards",
+        "demos": "demos left out",
         "goals": "candidate goals that did not hold (kept in `rejected_goals/`)",
     }
-    lines = [f"| {words[what]} | {reason} | {count} |" for what, counts in rejects.items() for reason, count in counts.items()]
-    return "\n".join(
-        ["## What was rejected\n", "| what | reason | count |", "|---|---|---|", *(lines or ["| nothing | | |"]), ""]
-    )
+    lines = [(words[what], reason, count) for what, counts in rejects.items() for reason, count in counts.items()]
+    return "## What was rejected\n\n" + (_table(["what", "reason", "count"], lines) if lines else "Nothing.\n")
 
 
-def _arrays() -> str:
-    """The table of arrays, from the one that shards are written by."""
-    lines = [
-        "## Arrays\n",
-        "Each shard is a Zarr v3 group. Ragged arrays hold the rows of all demos one after another; demo `d` is rows "
-        "`offsets[d]` to `offsets[d + 1]` of its group. `T_a_b` maps b-coordinates to a. World frame: right-handed, z up.\n",
-        "| array | dtype | rows | unit | frame | what |",
-        "|---|---|---|---|---|---|",
-    ]
+ARRAYS_HEAD = ("array", "dtype", "shape", "unit", "frame", "what")
+
+
+def _arrays() -> Iterator[tuple[str, ...]]:
+    """The lines of the table of arrays, from the one that shards are written by."""
     for column in columns():
         about = column.metadata
-        shape = " x ".join(str(dim) for dim in about["dims"])
+        dims = about["dims"] if is_ragged(column) else about["dims"][1:]
         codes = f" ({', '.join(f'{i} {name}' for i, name in enumerate(about['names']))})" if about["names"] else ""
-        cells = [f"`{about['path']}`", about["dtype"].lstrip("<|"), shape, about["unit"], about["frame"]]
-        lines.append(f"| {' | '.join(cells)} | {about['description']}{codes} |")
-    return "\n".join([*lines, ""])
+        shape = " x ".join(map(str, dims)) or "-"
+        yield (
+            f"`{about['path']}`",
+            about["dtype"].lstrip("<|"),
+            shape,
+            about["unit"],
+            about["frame"],
+            about["description"] + codes,
+        )
 
 
-def _how(manifest: Mapping[str, Any]) -> str:
-    recipe = manifest["recipe"]
-    lines = ["## How it was made\n"]
-    for name, entry in manifest["stages"].items():
-        if not entry["units"]:
-            continue
-        spec, sections = entry["spec"], ", ".join(sorted(entry["spec"]["sections"]))
+DOES = {  # what a stage did; stages of other names are listed without a word
+    "demonstrate": "draws a scene, settles the object at every candidate goal, shakes the container and moves the object in",
+    "observe": "looks at container and object with noisy depth cameras and fuses what they see",
+    "cluster": "partitions the clouds into superpoints",
+    "label": "computes affordance and correspondence of the demonstrated goal",
+}
+
+
+def _how(manifest: Mapping[str, Any], stages: Mapping[str, Mapping[str, Any]]) -> str:
+    recipe, lines = manifest["recipe"], []
+    for name, spec in stages.items():
+        does = f" {DOES[name]}" if name in DOES else ""
         versions = ", ".join(f"{package} {number}" for package, number in sorted(spec["packages"].items()))
-        lines.append(f"- `{name}` version {spec['version']} ({versions}), recipe sections {sections}")
-    lines += [
-        "",
-        f"Seed {recipe['seed']}. The whole recipe, every default filled in, is in `manifest.json`; with it and the versions "
-        f"above the same bytes come out again. Content digest: `{manifest['content_sha256']}`.",
-        "",
-        f"Licence: {LICENSE}.",
-        "",
-    ]
-    return "\n".join(lines)
+        lines.append(f"- `{name}`{does} (version {spec['version']}; {versions}; recipe: {', '.join(sorted(spec['sections']))})")
+    made = "\n".join(lines)
+    return f"""## How it was made
+
+{made}
+
+Seed {recipe["seed"]}. The recipe below, saved as a file and given to `dapdata generate` and then `dapdata label`, makes the
+same arrays again with the versions above; their digest is `{manifest["content_sha256"]}`.
+
+<details><summary>The recipe, every default filled in</summary>
+
+```json
+{json.dumps(recipe, indent=1)}
+```
+
+</details>
+"""

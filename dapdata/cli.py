@@ -509,6 +509,79 @@ def run(
     show({**left, "result": report}, as_json, made_text(report, left))
 
 
+# Other formats ---------------------------------------------------------------------------------------------
+
+exports = typer.Typer(no_args_is_help=True, rich_markup_mode=None, epilog="Example: dapdata export parquet DATASET --out DIR")
+app.add_typer(exports, name="export", help="Write a dataset in the format of other tools.")
+
+Target = Annotated[Path, _option("--out", help="Folder to write; must be new or empty", metavar="DIR")]
+OneSplit = Annotated[Split | None, _option("--split", help="Only this split", default="all, each in files of its own")]
+AtMost = Annotated[int | None, _option("--demos", help="Only so many demos, the first ones", default="all", min=1, metavar="N")]
+InFile = Annotated[int | None, _option("--shard-size", help="Demos in a file", default="the format's", min=1, metavar="N")]
+
+
+@exports.command("webdataset", epilog="Example: dapdata export webdataset data/can_cabinet --out tars --shard-size 200")
+def export_webdataset(
+    out: Target,
+    dataset: LastDataset = None,
+    split: OneSplit = None,
+    demos: AtMost = None,
+    shard_size: InFile = None,
+    as_json: Json = False,
+) -> None:
+    """Tar files of npy and json, to be streamed. One sample a demo; 500 in a file."""
+    _export("webdataset", dataset, out, as_json, split=split, demos=demos, shard_size=shard_size)
+
+
+@exports.command("parquet", epilog="Example: dapdata export parquet data/can_cabinet --out hub --no-previews")
+def export_parquet(
+    out: Target,
+    dataset: LastDataset = None,
+    split: OneSplit = None,
+    demos: AtMost = None,
+    shard_size: InFile = None,
+    previews: Annotated[bool, typer.Option("--previews/--no-previews", help="Draw a picture of each demo.")] = True,
+    as_json: Json = False,
+) -> None:
+    """Parquet files for the Hugging Face viewer, datasets, pandas. One row a demo; 1000 in a file."""
+    _export("parquet", dataset, out, as_json, split=split, demos=demos, shard_size=shard_size, previews=previews)
+
+
+@exports.command("pointcept", epilog="Example: dapdata export pointcept data/can_cabinet --out pointcept/data/can_cabinet")
+def export_pointcept(
+    out: Target,
+    dataset: LastDataset = None,
+    split: OneSplit = None,
+    demos: AtMost = None,
+    as_json: Json = False,
+) -> None:
+    """Folders of npy for Pointcept's DefaultDataset. Where to place, as segmentation of the clouds."""
+    _export("pointcept", dataset, out, as_json, split=split, demos=demos)
+
+
+@exports.command("scenes", epilog="Example: dapdata export scenes data/can_cabinet --out scenes --split test --demos 20")
+def export_scenes(
+    out: Target,
+    dataset: LastDataset = None,
+    split: OneSplit = None,
+    demos: AtMost = None,
+    as_json: Json = False,
+) -> None:
+    """GLB and URDF of the true scenes. Container and clutter, the object, every goal as a frame."""
+    _export("scenes", dataset, out, as_json, split=split, demos=demos)
+
+
+def _export(kind: str, dataset: str | None, out: Path, as_json: bool, **options: Any) -> None:
+    """Runs one export; options that were not given are the format's own."""
+    from importlib import import_module
+
+    folder, write = last("dataset", dataset), import_module(f"dapdata.interop.{kind}").export
+    given = {name: value for name, value in options.items() if value is not None}
+    with progress(f"export {kind}", "demo") as advance:
+        made = write(folder, out, **given, progress=advance)
+    show({"out": str(made), "format": kind, "dataset": str(folder), **options}, as_json, str(made))
+
+
 # Around ----------------------------------------------------------------------------------------------------
 
 

@@ -100,6 +100,9 @@ class TrainConfig(Section):
     )
     minutes: float = key(30.0, "wall-clock budget of both networks together", unit="min", gt=0, le=100_000)
     demos: int | None = key(None, "train on the first so many demos of the train split; null: on all", ge=1, le=10_000_000)
+    seed: int | None = key(
+        None, "of the first weights and of all draws in training; null: the recipe's `seed`", ge=0, le=2**32 - 1
+    )
     affordance_share: float = key(
         0.5,
         "share of the minutes that net 1 gets where the networks are trained one after the other (GPU, single core)",

@@ -20,7 +20,7 @@ import socket
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from hashlib import file_digest, sha256
 from pathlib import Path
 from typing import Any, Protocol
@@ -37,6 +37,9 @@ observer: Callable[[str, Path], None] | None = None  # tests set it to see, or t
 
 class Mirror(Protocol):
     """Repeats elsewhere what is made durable below a folder of this machine."""
+
+    def hold(self) -> AbstractContextManager[None]:
+        """Keeps other writers away there, as `lock` does here; brings here what they have done until now."""
 
     def commit(self, folder: Path) -> bool:
         """A folder was moved to its place here; False if there is another there already, which is then here too."""
@@ -112,7 +115,12 @@ def staged(root: Path, name: str) -> Iterator[Path]:
 
 
 def commit(folder: Path, target: Path) -> bool:
-    """Moves a staged folder to its place for good; False if there is something already, which is left as it is."""
+    """Moves a staged folder to its place for good; False if there is something already (then nothing is changed).
+
+    A single file may be moved too; it replaces one that has its name.
+    """
+    if folder.is_file():
+        _fsync(folder)
     for path, _, files in os.walk(folder, topdown=False):
         for file in sorted(files):
             _fsync(Path(path, file))
@@ -194,8 +202,10 @@ def lock(root: Path) -> Iterator[None]:
         file.write(this_process())
         file.flush()
         sweep(root)
+        mirror = mirror_of(root)
         try:
-            yield
+            with mirror.hold() if mirror else nullcontext():
+                yield
         finally:
             sweep(root)
             file.truncate(0)

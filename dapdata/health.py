@@ -104,7 +104,8 @@ def verify(root: str | Path, *, quick: bool = False, progress: Progress | None =
     problems = list(_single_files(root, found)) + list(_extra_files(root, found))
     files, digests, rows = len(found.files), [], []
     shard_paths = {entry.path for entry in found.shards}
-    entries = {entry.path: entry for entry in manifest.units(found)}
+    is_slim = _is_slim(root, found)
+    entries = {entry.path: entry for entry in (found.shards if is_slim else manifest.units(found))}
     for done, entry in enumerate(entries.values(), 1):
         with remote.filled(root / entry.path):
             record, damage = _unit_files(root, entry)
@@ -120,6 +121,11 @@ def verify(root: str | Path, *, quick: bool = False, progress: Progress | None =
         problems += list(_claims(root, found, rows, digests))
     demos = 0 if quick else len(rows)
     return Audit(str(root), tuple(problems), tuple(_notes(root, found)), files, demos, found.content_sha256)
+
+
+def _is_slim(root: Path, found: Manifest) -> bool:
+    """Whether this is a copy of the shards alone: all upstream units were left behind, as when only readers are served."""
+    return bool(found.shards) and not (root / "stages").exists()
 
 
 def _single_files(root: Path, found: Manifest) -> Iterator[str]:
@@ -217,6 +223,8 @@ def _leaks(index: Mapping[str, Array], found: Manifest) -> Iterator[str]:
 
 
 def _notes(root: Path, found: Manifest) -> Iterator[str]:
+    if _is_slim(root, found):
+        yield "stages/ is not here: the shards are complete in themselves, but cannot be labelled again"
     count, size = len(_unnamed(root, found)), sum(_size(path) for path in _unnamed(root, found))
     if count:
         yield f"{count} units ({size / 1e6:.1f} MB) are of other recipes or labellings; `dapdata gc` frees them"
@@ -321,7 +329,7 @@ def _statistics(index: Mapping[str, Array]) -> dict[str, dict[str, float]]:
     }
 
 
-@remote.on_copy(units=True, write=True)
+@remote.on_copy(units=True)
 def gc(root: str | Path, *, dry_run: bool = False) -> Facts:
     """Removes units that the manifest does not name: other recipes, other labellings, what killed processes left.
 
@@ -332,8 +340,9 @@ def gc(root: str | Path, *, dry_run: bool = False) -> Facts:
         LockedError: if a command is at work on the dataset.
     """
     root = Path(root)
-    found = manifest.read(root)
+    manifest.read(root)  # what is no dataset is refused before it is locked
     with durable.lock(root):
+        found = manifest.read(root)
         doomed = _unnamed(root, found)
         size = sum(_size(path) for path in doomed)
         for path in () if dry_run else doomed:

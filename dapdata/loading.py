@@ -110,6 +110,11 @@ class Dataset:
                 )
             return store.read_block(folder, paths)
 
+    def files(self, names: Sequence[str]) -> dict[str, bytes]:
+        """The bytes of single files that the manifest names, such as previews, by their path."""
+        with remote.working_copy(self.root, files=names) as folder:
+            return {name: (folder / name).read_bytes() for name in names}
+
     def torch(self, paths: Sequence[str] | None = None) -> data.Dataset[Any]:
         """A map-style dataset of {path: tensor}, all of it in memory.
 

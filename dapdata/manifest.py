@@ -27,6 +27,7 @@ FORMAT = 1
 MANIFEST = "manifest.json"
 INDEX = "index.parquet"
 CARD = "README.md"
+CROISSANT = "croissant.json"
 PREVIEWS = "preview"
 PROGRESS = "progress.json"  # what a running or interrupted command works on
 LOG = "log.jsonl"  # when each unit was made, by whom, how long it took: never read by the data's users
@@ -174,7 +175,7 @@ def _holds(path: Path, data: bytes) -> bool:
 
 def single_files(root: Path) -> list[str]:
     """The single files that belong to datasets and are there, whether or not a manifest survived that names them."""
-    found = [root / INDEX, root / CARD, *(root / PREVIEWS).glob("*")]
+    found = [root / INDEX, root / CARD, root / CROISSANT, *(root / PREVIEWS).glob("*")]
     return [path.relative_to(root).as_posix() for path in found if path.is_file()]
 
 

@@ -121,15 +121,33 @@ def panels(sample: Sample, top: float, size: tuple[int, int] = PANEL, inset: int
     coloured = {
         "cloud": lit(height_colors(points[:, 2], top), normals, camera),
         "superpoints": lit(superpoint_colors(superpoint.max() + 1)[superpoint], normals, camera, 0.25),
-        "affordance": lit(affordance_colors(sample["container_superpoints/affordance"][superpoint]), normals, camera, 0.2),
+        "affordance": _affordance(sample, camera),
     }
-    pictures = {}
-    for name, colors in coloured.items():
-        canvas = blank(camera)
-        paint(canvas, seen, colors)
-        draw_ground(canvas, sample["pose/T_world_container"][:3, 3], radius=0.6)
-        pictures[name] = image(canvas)
+    pictures = {name: _cloud_picture(sample, camera, seen, colors) for name, colors in coloured.items()}
     return pictures | {"goals": goal_picture(sample, camera)} | _object_pictures(sample, inset)
+
+
+def preview(sample: Sample, width: int, height: int) -> Array:
+    """(height, 2 width, 3) uint8: the affordance on the observed cloud, and beside it all goals in the true scene."""
+    camera = front_view(sample, width, height)
+    points, normals = sample["container/points"].astype(float), sample["container/normals"].astype(float)
+    seen = splat(blank(camera).camera, points, normals, POINT_RADIUS)
+    cloud = _cloud_picture(sample, camera, seen, _affordance(sample, camera))
+    return np.concatenate([cloud, goal_picture(sample, camera)], axis=1)
+
+
+def _affordance(sample: Sample, camera: Camera) -> Array:
+    """(N, 3) colours of the container's points by the affordance of their superpoints."""
+    score = sample["container_superpoints/affordance"][sample["container/superpoint"]]
+    return lit(affordance_colors(score), sample["container/normals"].astype(float), camera, 0.2)
+
+
+def _cloud_picture(sample: Sample, camera: Camera, seen: tuple[Array, Array], colors: Array) -> Array:
+    """(height, width, 3) uint8: the container's cloud, as `splat` found it, in (N, 3) colours, on the table."""
+    canvas = blank(camera)
+    paint(canvas, seen, colors)
+    draw_ground(canvas, sample["pose/T_world_container"][:3, 3], radius=0.6)
+    return image(canvas)
 
 
 def png(pixels: Array) -> bytes:

@@ -108,7 +108,7 @@ def generate(
     given = recipe_or_path if not isinstance(recipe_or_path, (str, Path)) else recipe.load(recipe_or_path)
     place, stages = remote.locate(out or Path("data") / given.name), import_module(table).STAGES
     resolved = recipe.resolve(given)
-    with remote.working_copy(place, units=True, write=not dry_run) as root:
+    with remote.working_copy(place, units=True) as root:
         command = _Command(place, root, table, stages, GENERATE, given, resolved, specs(stages, resolved))
         return command.plan(fresh) if dry_run else command.run(workers, engine, fresh, progress)
 
@@ -134,7 +134,7 @@ def label(
         UsageError: for an override of what earlier stages read.
     """
     place, stages = remote.locate(dataset), import_module(table).STAGES
-    with remote.working_copy(place, units=True, write=not dry_run) as root:
+    with remote.working_copy(place, units=True) as root:
         found = manifest.read(root)
         given = import_module(table).parse(found.recipe, overrides, str(root / manifest.MANIFEST))
         resolved = recipe.resolve(given)
@@ -146,7 +146,7 @@ def label(
         return command.plan(False) if dry_run else command.run(workers, engine, False, progress)
 
 
-@remote.on_copy(write=True)
+@remote.on_copy()
 def attach(dataset: str | Path, pictures: Mapping[str, bytes]) -> None:
     """Adds pictures, by their path such as "preview/goals.png", to a labelled dataset, its manifest and its card."""
     root = Path(dataset)

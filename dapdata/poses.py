@@ -54,6 +54,12 @@ def rotation_about(axis: Array | tuple[float, float, float], angle: float) -> Ar
     return np.asarray(np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * K @ K)
 
 
+def rotation_by(turn: Array) -> Array:
+    """(3, 3) rotation by a rotation vector (3,): about its direction, by its length in rad; zero turns nothing."""
+    angle = float(np.linalg.norm(turn))
+    return rotation_about(turn, angle) if angle > 0 else np.eye(3)
+
+
 def random_rotation(rng: np.random.Generator) -> Array:
     """(3, 3) rotation, uniform over SO(3) (a normalised Gaussian quaternion)."""
     w, x, y, z = (q := rng.normal(size=4)) / np.linalg.norm(q)

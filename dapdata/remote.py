@@ -44,7 +44,7 @@ SCRATCH = "dapdata-copy-"
 ALIVE = "alive"  # file in a scratch folder that its process holds locked
 SETTLED = 60.0  # s: a scratch folder this old has its lock, if its process lives
 UNIT_ROOT = "zarr.json"
-SINGLE = (MANIFEST, manifest.INDEX, manifest.CARD, manifest.PROGRESS, manifest.LOG)
+SINGLE = (MANIFEST, manifest.INDEX, manifest.CARD, manifest.CROISSANT, manifest.PROGRESS, manifest.LOG)
 WITH_FILES = (manifest.PREVIEWS, "quarantine")
 WITH_UNITS = ("stages", "shards")  # and a folder between them and each unit
 LOOKS = 5  # at a dataset that is published anew while it is read
@@ -70,19 +70,15 @@ def locate(place: Place) -> Place:
 
 
 @contextmanager
-def working_copy(
-    place: Place, *, files: Sequence[str] | None = None, units: bool = False, write: bool = False
-) -> Iterator[Path]:
+def working_copy(place: Place, *, files: Sequence[str] | None = None, units: bool = False) -> Iterator[Path]:
     """The dataset as a folder of this machine: the folder itself, or a working copy of one in a store.
 
     Args:
         place: The dataset's folder or URL.
         files: Single files to bring; all by default.
         units: Whether to bring the records of its units.
-        write: Whether it will be written to: takes the lease.
 
     Raises:
-        LockedError: if another command holds the lease.
         EnvironmentProblem: if the store cannot be reached, or refuses.
     """
     if not is_url(place):
@@ -92,8 +88,7 @@ def working_copy(
     with ExitStack() as stack:
         root = stack.enter_context(_scratch())
         stack.enter_context(_named(root, folder.url))
-        lease = stack.enter_context(_leased(folder)) if write else None
-        copy = Copy(folder, root, lease)
+        copy = Copy(folder, root)
         copy.pull_files(files)
         if units:
             copy.pull_units()
@@ -102,19 +97,17 @@ def working_copy(
             yield root
         finally:
             del durable.mirrors[root]
-            if write:
-                copy.push_log()
 
 
 def on_copy(
-    *, files: Sequence[str] | None = None, units: bool = False, write: bool = False
+    *, files: Sequence[str] | None = None, units: bool = False
 ) -> Callable[[Callable[Concatenate[Path, Arguments], Result]], Callable[Concatenate[Place, Arguments], Result]]:
     """Decorates a function of a dataset's folder so that it takes a URL as well; arguments as for `working_copy`."""
 
     def decorate(call: Callable[Concatenate[Path, Arguments], Result]) -> Callable[Concatenate[Place, Arguments], Result]:
         @wraps(call)
         def on_any(root: Place, /, *args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
-            with working_copy(root, files=files, units=units, write=write) as path:
+            with working_copy(root, files=files, units=units) as path:
                 result = call(path, *args, **kwargs)
                 return _renamed(result, str(path), str(root).rstrip("/")) if is_url(root) else result
 
@@ -190,10 +183,10 @@ def unit(place: Place, path: str, arrays: Sequence[str] | None = None) -> Iterat
 class Copy:
     """A working copy and where it came from; the Mirror of what is made durable in it."""
 
-    def __init__(self, folder: Folder, root: Path, lease: Lease | None) -> None:
-        self.folder, self.root, self.lease = folder, root, lease
-        self.tag: str | None = None  # of the manifest as this copy knows it
-        self.log = b""
+    def __init__(self, folder: Folder, root: Path) -> None:
+        self.folder, self.root = folder, root
+        self.lease: Lease | None = None
+        self.tag: str | None = None  # of the manifest as the holder of the lease knows it
 
     def name(self, path: Path) -> str:
         """The name in the store."""
@@ -210,8 +203,6 @@ class Copy:
             if not self._is_torn():
                 break
             time.sleep(PAUSE if look + 1 < LOOKS else 0)
-        log = self.root / manifest.LOG
-        self.log = log.read_bytes() if log.exists() else b""
 
     def _pull_manifest(self, wanted: bool) -> None:
         (self.root / MANIFEST).unlink(missing_ok=True)
@@ -259,18 +250,22 @@ class Copy:
             return {}
 
     def pull_units(self) -> None:
-        """Brings the records of all units that are not here yet."""
+        """Brings the records of all units that are not here yet, and takes away those that are gone."""
         if not self.folder.has_listing:
-            found = manifest.read(self.root)
-            self.pull_records([entry.path for entry in manifest.units(found)])
+            self.pull_records([entry.path for entry in manifest.units(manifest.read(self.root))])
             return
+        found: set[str] = set()
         for top in WITH_UNITS:
             for group, is_group in self.folder.children(top).items():
                 _place(self.root / top, group, is_group)
                 children = self.folder.children(f"{top}/{group}") if is_group and is_inside(group) else {}
                 for child, is_folder in children.items():
                     _place(self.root / top / group, child, is_folder)
-                self.pull_records(f"{top}/{group}/{child}" for child, is_folder in children.items() if is_folder)
+                found |= {f"{top}/{group}/{child}" for child, is_folder in children.items() if is_folder}
+            for here in self.root.glob(f"{top}/*/*"):
+                if here.is_dir() and self.name(here) not in found:
+                    shutil.rmtree(here)
+        self.pull_records(sorted(found))
 
     def pull_records(self, units: Iterable[str]) -> None:
         """Brings the records of these units, as far as they are there and not here yet."""
@@ -296,6 +291,26 @@ class Copy:
             return []
 
     # What is made durable here is repeated there: see durable.Mirror
+
+    @contextmanager
+    def hold(self) -> Iterator[None]:
+        """Takes the lease, and brings what others have published until now.
+
+        Raises:
+            LockedError: if another command holds it.
+        """
+        self.lease = Lease(self.folder)
+        with self.lease.held():
+            self.pull_files(None)
+            self.pull_units()
+            log = self.root / manifest.LOG
+            before = log.read_bytes() if log.exists() else b""
+            try:
+                yield
+            finally:
+                if log.exists() and log.read_bytes() != before:
+                    with suppress(EnvironmentProblem):  # it tells only how long things took
+                        self.folder.write(manifest.LOG, log.read_bytes())
 
     def commit(self, folder: Path) -> bool:
         """Uploads a unit, its root last; False if there is one already, which then takes the place of this."""
@@ -341,13 +356,6 @@ class Copy:
                 f"{self.folder.url}: {MANIFEST} was written by another command meanwhile, expected it as this one found it; "
                 "nothing of the other's was changed: run the same command again"
             ) from error
-
-    def push_log(self) -> None:
-        """Uploads the log of a command, which tells only how long its units took: no reason to fail."""
-        log = self.root / manifest.LOG
-        if log.exists() and log.read_bytes() != self.log:
-            with suppress(EnvironmentProblem):
-                self.folder.write(manifest.LOG, log.read_bytes())
 
 
 def _place(folder: Path, name: str, is_folder: bool) -> None:
@@ -404,23 +412,22 @@ def _renamed(value: Any, old: str, new: str) -> Any:
 # The lease -------------------------------------------------------------------------------------------------
 
 
-@contextmanager
-def _leased(folder: Folder) -> Iterator[Lease]:
-    lease = Lease(folder)
-    lease.take()
-    threading.Thread(target=lease.keep, daemon=True).start()
-    try:
-        yield lease
-    finally:
-        lease.give_back()
-
-
 class Lease:
     """The right of one command at a time to write to a dataset: an object with its holder and its end."""
 
     def __init__(self, folder: Folder) -> None:
         self.folder, self.tag, self.lost = folder, "", False
         self._turn, self._over = threading.Lock(), threading.Event()
+
+    @contextmanager
+    def held(self) -> Iterator[None]:
+        """Holds it, renewed now and then."""
+        self.take()
+        threading.Thread(target=self.keep, daemon=True).start()
+        try:
+            yield
+        finally:
+            self.give_back()
 
     def take(self) -> None:
         """Makes the object, or takes it over from a holder that is gone.

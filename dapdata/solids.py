@@ -7,7 +7,7 @@ cylinder's axis is its own z.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from hashlib import sha256
 from typing import Any, NamedTuple
@@ -330,6 +330,46 @@ def to_trimesh(kind: Array, size: Array, T: Array, sections: int = 64) -> Any:
             mesh.apply_scale(full)
         meshes.append(mesh.apply_transform(pose_))
     return trimesh.util.concatenate(meshes)
+
+
+class Node(NamedTuple):
+    """A frame of a GLB file, with a mesh in it or none."""
+
+    name: str  # unique
+    parent: str  # a node before it; "" for the world
+    T: Array  # (4, 4) T_parent_node, m
+    mesh: str = ""  # several nodes may show the same mesh
+
+
+Color = tuple[float, float, float, float]  # red, green, blue, opacity; each from 0 to 1
+Z_UP = "z_up"  # the node of a GLB file that is the world frame
+T_GLTF_WORLD = np.array([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])  # glTF's y is up, by its definition
+
+
+def to_glb(nodes: Sequence[Node], meshes: Mapping[str, tuple[Any, Color]]) -> bytes:
+    """A scene as a binary glTF file, in metres; its node `Z_UP` is the world frame, the parent of all others.
+
+    Args:
+        nodes: In an order in which parents come first.
+        meshes: By name, a `trimesh.Trimesh` and its colour.
+    """
+    trimesh = require("trimesh", "sim")
+    scene = trimesh.Scene()
+    scene.graph.update(frame_to=Z_UP, matrix=T_GLTF_WORLD)
+    for name, (mesh, color) in meshes.items():
+        mode = "BLEND" if color[3] < 1 else "OPAQUE"
+        material = trimesh.visual.material.PBRMaterial(
+            name=name, baseColorFactor=color, metallicFactor=0.0, roughnessFactor=0.8, alphaMode=mode
+        )
+        mesh = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+        mesh.visual = trimesh.visual.TextureVisuals(material=material)
+        scene.geometry[name] = mesh
+    for node in nodes:
+        scene.graph.update(
+            frame_from=node.parent or Z_UP, frame_to=node.name, matrix=node.T, **({"geometry": node.mesh} if node.mesh else {})
+        )
+    data: bytes = scene.export(file_type="glb")
+    return data
 
 
 def _triple(values: Vector) -> tuple[float, float, float]:

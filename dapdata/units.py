@@ -17,7 +17,9 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from dapdata import card, durable, manifest, remote, rng, split, store
+import numpy as np
+
+from dapdata import card, croissant, durable, manifest, remote, rng, split, store
 from dapdata.config import SplitConfig
 from dapdata.errors import CorruptionError, DapdataError, UsageError
 from dapdata.manifest import Manifest, Rejects, SplitEntry, StageEntry, UnitEntry
@@ -292,8 +294,14 @@ def publish(
 def _write(root: Path, now: Manifest, rows: Sequence[Mapping[str, Any]], previews: Mapping[str, bytes]) -> None:
     """Publishes a manifest with the files that follow from it."""
     index = {manifest.INDEX: manifest.index_bytes(rows)} if rows else {}
-    text = card.render(now.model_dump(mode="json"), rows, sorted(previews))
-    manifest.publish(root, now, {**index, **previews, manifest.CARD: text.encode()})
+    facts = now.model_copy(update={"shards": [], "stages": {}}).model_dump(mode="json")
+    stages = {name: entry.spec for name, entry in now.stages.items() if entry.units}
+    columns = {name: np.array([row[name] for row in rows]) for name in (rows[0] if rows else ())}
+    about = {manifest.CARD: card.render(facts, stages, len(rows), columns, sorted(previews)).encode()}
+    if rows:
+        folders = sorted({shard.path.rpartition("/")[0] for shard in now.shards})
+        about[manifest.CROISSANT] = croissant.render(facts, folders, columns, index[manifest.INDEX])
+    manifest.publish(root, now, {**index, **previews, **about})
 
 
 def attach(root: Path, pictures: Mapping[str, bytes]) -> None:

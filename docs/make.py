@@ -31,6 +31,7 @@ reader never sees half of a dataset. Its fields are in [`schemas/manifest.schema
 | `manifest.json` | format, `content_sha256`, resolved recipe, shards, splits with their instances, rejects by reason, stages |
 | `index.parquet` | one row per demo: split, shard, row, instances, counts, rejects |
 | `README.md`, `preview/` | dataset card and pictures |
+| `croissant.json` | the same for machines: files, columns of the index, arrays of a shard (Croissant, JSON-LD) |
 | `shards/<labelling>/00000.zarr` | the product: self-contained groups, ready to train on |
 | `stages/<stage>/<key>` | cached units of the upstream stages; only needed to label again or to go on |
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import socket
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -74,16 +75,20 @@ class Server:
     def stop(self) -> None:
         self._server.shutdown()
 
+    def _hang_up(self, environ: dict[str, Any]) -> Iterable[bytes]:
+        environ["werkzeug.socket"].shutdown(socket.SHUT_RDWR)
+        raise ConnectionAbortedError  # which werkzeug takes without a word
+
     def _answer(self, environ: dict[str, Any], start_response: Any) -> Iterable[bytes]:
         method, path = environ["REQUEST_METHOD"], environ["PATH_INFO"]
         self.requests.append((method, path))
         verdict = self.gate(method, path) if self.gate else None
         if verdict == "cut":
             environ["wsgi.input"].read(min(100, int(environ.get("CONTENT_LENGTH") or 0)))
-            raise ConnectionAbortedError  # werkzeug then closes without a word
+            return self._hang_up(environ)
         if verdict == "lost":
             list(self.app(environ, lambda *_: None))
-            raise ConnectionAbortedError
+            return self._hang_up(environ)
         if verdict is not None:
             status, code = verdict
             environ["wsgi.input"].read(int(environ.get("CONTENT_LENGTH") or 0))

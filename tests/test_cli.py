@@ -70,11 +70,11 @@ def test_every_command_has_help_with_an_example(name: str, capsys: pytest.Captur
 def test_the_commands_are_those_of_the_interface() -> None:
     assert set(COMMANDS) == {
         "init", "generate", "label", "train", "eval", "judge", "predict", "run", "status", "inspect", "verify", "show", "gc",
-        "schema", "bench", "compare",
+        "schema", "bench", "compare", "export",
     }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", sorted(set(COMMANDS) - {"init", "schema"}))
+@pytest.mark.parametrize("name", sorted(set(COMMANDS) - {"init", "schema", "export"}))
 def test_every_command_that_reports_does_so_for_machines_too(name: str) -> None:
     assert "--json" in {option for parameter in COMMANDS[name].params for option in parameter.opts}
 

@@ -7,12 +7,13 @@ import http.server
 import json
 import os
 import re
+import shlex
 import signal
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from hashlib import sha256
 from pathlib import Path
@@ -25,7 +26,7 @@ from s3_server import Server
 from toy_stages import toy_recipe
 
 import dapdata
-from dapdata import buckets, cli, health, manifest, pipeline, remote
+from dapdata import buckets, cli, durable, health, manifest, pipeline, remote
 from dapdata.buckets import Conflict, Folder
 from dapdata.errors import CorruptionError, EnvironmentProblem, FormatError, LockedError, QuarantineError, UsageError
 
@@ -42,6 +43,18 @@ from dapdata import pipeline
 from toy_stages import toy_recipe
 pipeline.generate(toy_recipe({DEMOS}, {SHARD_SIZE}), sys.argv[1], engine="inline", table="toy_stages")
 """
+
+
+def generate(url: str) -> None:
+    pipeline.generate(toy_recipe(DEMOS, SHARD_SIZE), url, engine="inline", table=TABLE)
+
+
+def label(url: str) -> None:
+    pipeline.label(url, engine="inline", table=TABLE)
+
+
+COMMANDS = (generate, label)
+REQUESTS: dict[Callable[[str], None], list[tuple[str, str]]] = {}  # that each made for `bucket_toy`
 
 
 @pytest.fixture(scope="module")
@@ -65,8 +78,11 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def bucket_toy(server: Server) -> str:
     """A labelled dataset of random arrays in a bucket. Not to be changed."""
-    url = f"{server.bucket('my-bucket')}/toy"
-    make_toy(url, DEMOS, SHARD_SIZE)
+    url = f"{server.bucket('my-bucket')}/quickstart"
+    for command in COMMANDS:
+        server.requests.clear()
+        command(url)
+        REQUESTS[command] = list(server.requests)
     return url
 
 
@@ -303,7 +319,7 @@ def test_a_dataset_that_is_being_published_is_none(memory: Folder) -> None:
 
 
 def test_the_second_writer_is_told_who_works(memory: Folder, capsys: pytest.CaptureFixture[str]) -> None:
-    with remote.working_copy(memory.url, write=True):
+    with remote.working_copy(memory.url) as root, durable.lock(root):
         before = objects_of(memory)
         assert health.status(memory.url).to_dict()["working"].startswith(f"process {os.getpid()} on ")
         assert cli.run_app(["gc", memory.url]) == 5
@@ -319,11 +335,12 @@ def test_of_two_publishers_one_fails_and_changes_nothing(server: Server, monkeyp
     pipeline.generate(toy_recipe(1, 1, seed=7), url, engine="inline", table=TABLE)
     if guard == "manifest":  # it must do alone, whatever the clocks
         monkeypatch.setattr(remote.Lease, "renew", lambda self: None)
-    with pytest.raises(LockedError, match="run the same command again"), remote.working_copy(url, write=True) as root:
+    with remote.working_copy(url) as root, durable.lock(root):
         Folder(url).remove([remote.LEASE])
         Folder(url).write("manifest.json", server.objects(url)["manifest.json"] + b" ")  # the other
         theirs = server.objects(url)
-        manifest.publish(root, manifest.read(root), {"README.md": b"mine"})
+        with pytest.raises(LockedError, match="run the same command again"):
+            manifest.publish(root, manifest.read(root), {"README.md": b"mine"})
     assert without_machinery(server.objects(url)) == without_machinery(theirs)
 
 
@@ -350,7 +367,7 @@ def test_a_lease_lasts_until_its_end_or_its_holder_dies(memory: Folder) -> None:
 
 def test_a_lease_is_renewed_as_long_as_its_holder_works(memory: Folder, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(remote, "LEASE_SECONDS", 0.4)
-    with remote.working_copy(memory.url, write=True):
+    with remote.working_copy(memory.url) as root, durable.lock(root):
         time.sleep(1.0)
         assert health.status(memory.url).to_dict()["working"]
     assert health.status(memory.url).to_dict()["working"] is None
@@ -473,10 +490,10 @@ def test_an_environment_that_does_not_fit_is_one_line(
     monkeypatch.setattr(buckets, "PATIENCE", 0.1)
     s3fs.S3FileSystem.clear_instance_cache()
     try:
-        line = one_line(capsys, ["inspect", "s3://my-bucket/toy"])
+        line = one_line(capsys, ["inspect", "s3://my-bucket/quickstart"])
     finally:
         s3fs.S3FileSystem.clear_instance_cache()
-    assert line.startswith("s3://my-bucket/toy: ")
+    assert line.startswith("s3://my-bucket/quickstart: ")
     assert said in line
 
 
@@ -486,7 +503,7 @@ def test_a_missing_extra_is_one_line(monkeypatch: pytest.MonkeyPatch, capsys: py
 
 
 def test_a_full_disk_is_said_of_the_disk_and_not_of_the_store(memory: Folder, tmp_path: Path) -> None:
-    code = f"""
+    code = """
 import resource
 from dapdata import buckets, pipeline
 from toy_stages import toy_recipe
@@ -638,3 +655,69 @@ def test_workers_share_nothing_but_the_store(server: Server, small: Path) -> Non
     url = f"{server.bucket()}/toy"
     make_toy(url, DEMOS, SHARD_SIZE, workers=2, engine="local")
     assert without_machinery(server.objects(url)) == without_machinery(files_of(small))
+
+
+# The page --------------------------------------------------------------------------------------------------
+
+PAGE = (HERE.parent / "docs/object_stores.md").read_text(encoding="utf-8")
+
+
+def blocks(language: str) -> list[str]:
+    return re.findall(rf"^```{language}\n(.*?)^```", PAGE, re.MULTILINE | re.DOTALL)
+
+
+def test_the_snippets_of_the_page_run_on_a_bucket(bucket_toy: str, small: Path) -> None:
+    with_dapdata, with_zarr = blocks("python")
+    left: dict[str, Any] = {}
+    exec(compile(with_dapdata, "docs", "exec"), left)
+    train = dapdata.open(small, split="train")
+    assert len(left["train"]) == len(left["tensors"]) == len(train)
+    assert np.array_equal(left["points"], train[0]["container/points"])
+    exec(compile(with_zarr, "docs", "exec"), left)
+    assert np.array_equal(left["score"], dapdata.open(small)[0]["container_superpoints/affordance"])
+
+
+def test_the_commands_of_the_page_run_on_a_bucket(
+    server: Server, bucket_toy: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Those that make something only say what they would make: the dataset here is of toys."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "recipes").symlink_to(HERE.parent / "recipes")
+    before = without_machinery(server.objects(bucket_toy))
+    for line in blocks("sh")[0].splitlines()[1:]:
+        name, *words = shlex.split(line)
+        assert name == "dapdata"
+        makes = ["--dry-run"] if words[0] in ("generate", "label") else []
+        assert cli.run_app([*words, *makes]) == 0, line
+        assert capsys.readouterr().out
+    assert without_machinery(server.objects(bucket_toy)) == before
+    assert {path.name for path in tmp_path.glob("quickstart.*")} == {"quickstart.png", "quickstart.html"}
+
+
+def test_the_page_counts_the_requests_of_a_unit(server: Server, bucket_toy: str, small: Path) -> None:
+    table = dict(re.findall(r"^\| `(generate|label|verify)` \| (\d+ \| \d+)", PAGE, re.MULTILINE))
+
+    def each(requests: list[tuple[str, str]]) -> str:
+        of_units = [method for method, path in requests if "/stages/" in path or "/shards/" in path]
+        count = {method: of_units.count(method) / (DEMOS / SHARD_SIZE) for method in ("PUT", "GET")}
+        assert len(of_units) == of_units.count("PUT") + of_units.count("GET")
+        assert len(requests) - len(of_units) < 40
+        return f"{count['PUT']:.0f} | {count['GET']:.0f}"
+
+    server.requests.clear()
+    health.verify(bucket_toy)
+    asked = {"generate": REQUESTS[generate], "label": REQUESTS[label], "verify": list(server.requests)}
+    assert {name: each(requests) for name, requests in asked.items()} == table
+    files = len(files_of(small / manifest.read(small).shards[0].path))
+    assert f"| reading a shard, all arrays | 0 | {files} |" in PAGE
+
+
+@pytest.mark.usefixtures("bucket_toy")
+def test_a_public_bucket_is_read_without_credentials(monkeypatch: pytest.MonkeyPatch) -> None:
+    (line,) = re.findall(r"^export (FSSPEC_S3_ANON)=(\w+)", PAGE, re.MULTILINE)
+    for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
+        monkeypatch.delenv(name)
+    code = "import dapdata; print(dapdata.open('s3://my-bucket/quickstart').task)"
+    environment = os.environ | {line[0]: line[1]}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    assert done.stdout == "can_cabinet\n"

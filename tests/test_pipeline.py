@@ -190,7 +190,7 @@ def test_a_dry_run_writes_nothing(tmp_path: Path) -> None:
 def test_previews_join_the_manifest_and_the_card(toy_copy: Path, toy: Path) -> None:
     pipeline.attach(toy_copy, {"preview/goals.png": b"a picture"})
     assert "preview/goals.png" in manifest.read(toy_copy).files
-    assert "![preview/goals.png]" in (toy_copy / "README.md").read_text()
+    assert "](preview/goals.png)" in (toy_copy / "README.md").read_text()
     assert health.verify(toy_copy).ok
     make_toy(toy_copy)
     assert "preview/goals.png" in manifest.read(toy_copy).files

@@ -15,6 +15,7 @@ from dapdata.poses import (
     random_rotation,
     rotate,
     rotation_about,
+    rotation_by,
     symmetric_distance,
     tilt,
     transform,
@@ -138,3 +139,16 @@ def test_tilt_is_the_angle_from_upright_and_folds_where_the_symmetry_flips(angle
 def test_an_unknown_symmetry_is_named():
     with pytest.raises(ValueError, match="none, box or revolution"):
         nearest_symmetric(np.eye(4), np.eye(4), "screw", Z)
+
+
+@given(seeds, st.floats(1e-9, 3.0))
+def test_a_rotation_vector_and_its_opposite_cancel_and_its_length_is_the_angle(seed, angle):
+    direction = np.random.default_rng(seed).normal(size=3)
+    turn = angle * direction / np.linalg.norm(direction)
+    assert np.allclose(rotation_by(turn) @ rotation_by(-turn), np.eye(3), **close)
+    assert np.isclose(angle_between(rotation_by(turn), np.eye(3)), angle, **close)
+    assert np.allclose(rotation_by(turn) @ turn, turn, **close)
+
+
+def test_a_rotation_vector_of_no_length_turns_nothing():
+    assert np.array_equal(rotation_by(np.zeros(3)), np.eye(3))

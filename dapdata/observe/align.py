@@ -17,7 +17,7 @@ import numpy as np
 from numba import njit
 
 from dapdata.observe.cameras import View
-from dapdata.poses import inverse, pose, rotate, rotation_about, transform
+from dapdata.poses import inverse, pose, rotate, rotation_by, transform
 from dapdata.records import Array
 
 IMAGE_ROWS = 240  # partners are sought in images of about this height: of larger ones every 4th, 9th, ... point is taken
@@ -58,8 +58,7 @@ def align(views: list[View], points: list[Array], normals: list[Array]) -> Array
         moved += step
         for v in range(len(views)):
             shift, turn = step[6 * v : 6 * v + 3], step[6 * v + 3 : 6 * v + 6]
-            angle = float(np.linalg.norm(turn))
-            T[v] = T[v] @ pose(rotation_about(turn, angle) if angle > 0 else np.eye(3), shift)
+            T[v] = T[v] @ pose(rotation_by(turn), shift)
         if np.abs(step).max() < CONVERGED:
             break
     return T

@@ -13,7 +13,7 @@ import numpy as np
 from dapdata.observe import CamerasConfig, NoiseConfig
 from dapdata.observe.noise import PRESETS
 from dapdata.observe.raycast import corners
-from dapdata.poses import pose, rotation_about, transform
+from dapdata.poses import pose, rotation_by, transform
 from dapdata.records import Array, Demo
 
 
@@ -96,6 +96,4 @@ def _pose_error(noise: NoiseConfig, normal: Array) -> Array:
     preset = PRESETS[noise.preset]
     translation = preset.camera_translation if noise.camera_translation is None else noise.camera_translation
     rotation_deg = preset.camera_rotation_deg if noise.camera_rotation_deg is None else noise.camera_rotation_deg
-    turn = np.radians(rotation_deg) * normal[3:]
-    angle = float(np.linalg.norm(turn))
-    return pose(rotation_about(turn, angle) if angle > 0 else np.eye(3), translation * normal[:3])
+    return pose(rotation_by(np.radians(rotation_deg) * normal[3:]), translation * normal[:3])

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from dapdata import loading, metrics, predictions
 from dapdata import rng as rngs
 from dapdata.config import EvalConfig
+from dapdata.console import seldom
 from dapdata.errors import FormatError, UsageError
 from dapdata.loading import Dataset
 from dapdata.matching import affordance_quality
@@ -39,7 +40,6 @@ Say = Callable[[str], None]
 
 LEARNED = ("dap", "cap")
 UNREADABLE = "unreadable_cloud"  # status of a scene whose clouds the networks cannot be given
-SAY_EVERY = 5.0  # s between lines
 
 
 @dataclass
@@ -96,7 +96,7 @@ def evaluate(
         CheckpointError: a run of another task, or none.
         CorruptionError: the recorded goals fail before this judge; the report is written first.
     """
-    say = _seldom(say or (lambda line: print(line, file=sys.stderr, flush=True)))
+    say = seldom(say or (lambda line: print(line, file=sys.stderr, flush=True)))
     predictor = _load(run, method, device, changes or {})
     dataset = loading.open(data if data is not None else data_of(run), split)
     config = EvalConfig.model_validate(dataset.recipe.get("eval", {}))
@@ -342,16 +342,3 @@ def _film(predictor: Predictor | None, samples: Sequence[Sample], found: Proposa
     several = [s for s in readable if len(s["goals/T_world_object"]) >= ROWS]
     say("pictures: from noise to one place")
     return film(predictor, (several or readable)[0], seed) if readable else None
-
-
-def _seldom(say: Say) -> Say:
-    """The same, but with at most a line every few seconds."""
-    last = -np.inf
-
-    def speak(line: str) -> None:
-        nonlocal last
-        if time.monotonic() - last >= SAY_EVERY:
-            last = time.monotonic()
-            say(line)
-
-    return speak

@@ -156,7 +156,7 @@ def train(
         prepared(train_split, demos, rule, config),
         prepared(val_split, min(len(val_split), VALIDATION_SCENES), rule, every_goal),
         rule,
-        int(whole.recipe["seed"]),
+        int(whole.recipe["seed"]) if config.seed is None else config.seed,
         task,
     )
     seconds = None if minutes is None else 60 * minutes - (time.monotonic() - started)

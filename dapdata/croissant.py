@@ -1,0 +1,154 @@
+"""The dataset's Croissant description (JSON-LD): what search engines and loaders of the format read.
+
+Two record sets can be loaded by it: `demos`, the rows of the index, and `arrays`, the table of what a shard holds. The
+shards themselves are a set of files without records: Croissant's readers know no Zarr.
+
+Nothing in it but what follows from the manifest and the index; hence no date of publication, which its validators
+recommend: whoever publishes the dataset adds it.
+
+Source: Croissant format specification 1.0, MLCommons.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from hashlib import sha256
+from typing import Any
+
+from dapdata import card
+from dapdata.records import Array, columns, is_ragged
+
+CONTEXT = {
+    "@language": "en",
+    "@vocab": "https://schema.org/",
+    "citeAs": "cr:citeAs",
+    "column": "cr:column",
+    "conformsTo": "dct:conformsTo",
+    "cr": "http://mlcommons.org/croissant/",
+    "data": {"@id": "cr:data", "@type": "@json"},
+    "dataType": {"@id": "cr:dataType", "@type": "@vocab"},
+    "dct": "http://purl.org/dc/terms/",
+    "equivalentProperty": "cr:equivalentProperty",
+    "examples": {"@id": "cr:examples", "@type": "@json"},
+    "extract": "cr:extract",
+    "field": "cr:field",
+    "fileObject": "cr:fileObject",
+    "fileProperty": "cr:fileProperty",
+    "fileSet": "cr:fileSet",
+    "format": "cr:format",
+    "includes": "cr:includes",
+    "isLiveDataset": "cr:isLiveDataset",
+    "jsonPath": "cr:jsonPath",
+    "key": "cr:key",
+    "md5": "cr:md5",
+    "parentField": "cr:parentField",
+    "path": "cr:path",
+    "rai": "http://mlcommons.org/croissant/RAI/",
+    "recordSet": "cr:recordSet",
+    "references": "cr:references",
+    "regex": "cr:regex",
+    "repeated": "cr:repeated",
+    "replace": "cr:replace",
+    "samplingRate": "cr:samplingRate",
+    "sc": "https://schema.org/",
+    "separator": "cr:separator",
+    "source": "cr:source",
+    "subField": "cr:subField",
+    "transform": "cr:transform",
+}
+INDEX, SHARDS = "index.parquet", "shards"
+SENTENCES = {  # columns of the index whose name does not say it all
+    "demo": "index of the demo in the dataset",
+    "split": "train, val or test; unused: shares an instance with two of them",
+    "shard": "path of the Zarr group that holds the demo",
+    "row": "number of the demo in its shard",
+    "task": "name of the task",
+    "sha256": "digest of the demo's decoded arrays",
+    "container_instance": "digest of the geometry of container and clutter",
+    "object_instance": "digest of the object's geometry",
+    "attempts": "scenes drawn until this one was accepted",
+}
+ABOUT_ARRAYS = ("path", "dtype", "shape", "unit", "frame", "description", "codes")
+
+
+def render(manifest: Mapping[str, Any], folders: Sequence[str], index: Mapping[str, Array], index_file: bytes) -> bytes:
+    """The description as JSON.
+
+    Args:
+        manifest: As JSON data, of a labelled dataset; its shards and stages are not looked at.
+        folders: Where the shards are.
+        index: Its columns.
+        index_file: The same as a Parquet file.
+    """
+    tree = {
+        "@context": CONTEXT,
+        "@type": "sc:Dataset",
+        "conformsTo": "http://mlcommons.org/croissant/1.0",
+        "name": manifest["name"],
+        "description": card.summary(manifest, len(index["demo"]), index),
+        "license": card.LICENSE_URL,
+        "citeAs": card.citation(manifest),
+        "creator": {"@type": "sc:Organization", "name": "dapdata"},
+        "keywords": [*card.TAGS, manifest["task"]],
+        "version": f"{manifest['format']}.0.0+{manifest['content_sha256'][:12]}",
+        "rai:dataCollection": "Drawn from a recipe, settled in a physics simulator, observed by simulated depth cameras.",
+        "rai:dataCollectionType": "Software Collection",
+        "rai:dataLimitation": "Ideal solids without texture; modelled depth noise; one object; containers do not move.",
+        "rai:personalSensitiveInformation": "None: nothing in it was recorded.",
+        "distribution": _distribution(folders, index_file),
+        "recordSet": [_demos(index), _arrays()],
+    }
+    return json.dumps(tree, indent=1, ensure_ascii=False).encode() + b"\n"
+
+
+def _distribution(folders: Sequence[str], index_file: bytes) -> list[dict[str, Any]]:
+    return [
+        {
+            "@type": "cr:FileObject",
+            "@id": INDEX,
+            "name": INDEX,
+            "description": "One row per demo: where it is, its split, instances and counts.",
+            "contentUrl": INDEX,
+            "contentSize": f"{len(index_file)} B",
+            "encodingFormat": "application/x-parquet",
+            "sha256": sha256(index_file).hexdigest(),
+        },
+        {
+            "@type": "cr:FileSet",
+            "@id": SHARDS,
+            "name": SHARDS,
+            "description": "Zarr v3 groups; manifest.json names each with its sha256.",
+            "encodingFormat": "application/vnd.zarr",
+            "includes": [f"{folder}/**" for folder in folders],
+        },
+    ]
+
+
+def _demos(index: Mapping[str, Array]) -> dict[str, Any]:
+    """The index as a record set."""
+    fields = [
+        {
+            "@type": "cr:Field",
+            "@id": f"demos/{name}",
+            "name": name,
+            "description": SENTENCES.get(name, name.replace("_", " ")),
+            "dataType": "sc:Text" if column.dtype.kind == "U" else "sc:Integer",
+            "source": {"fileObject": {"@id": INDEX}, "extract": {"column": name}},
+        }
+        for name, column in index.items()
+    ]
+    return {"@type": "cr:RecordSet", "@id": "demos", "name": "demos", "key": {"@id": "demos/demo"}, "field": fields}
+
+
+def _arrays() -> dict[str, Any]:
+    """The table of arrays as a record set whose records stand in the description itself."""
+    fields = [{"@type": "cr:Field", "@id": f"arrays/{name}", "name": name, "dataType": "sc:Text"} for name in ABOUT_ARRAYS]
+    records = []
+    for column in columns():
+        about = column.metadata
+        dims = about["dims"] if is_ragged(column) else about["dims"][1:]
+        shape, codes = " x ".join(map(str, dims)), ", ".join(f"{i} {name}" for i, name in enumerate(about["names"]))
+        record = {**about, "dtype": about["dtype"].lstrip("<|"), "shape": shape, "codes": codes}
+        records.append({f"arrays/{name}": record[name] for name in ABOUT_ARRAYS})
+    return {"@type": "cr:RecordSet", "@id": "arrays", "name": "arrays", "field": fields, "data": records}

@@ -5,7 +5,7 @@ SHELL := bash
 .SHELLFLAGS := -euo pipefail -c
 .ONESHELL:
 .DEFAULT_GOAL := help
-.PHONY: help env demo test test-all bench check schemas clean
+.PHONY: help env demo test test-all bench check schemas docs clean
 
 PYTHON := .venv/bin/python
 IS_311 := -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))'
@@ -43,7 +43,7 @@ demo: env
 test: check
 	@$(PYTHON) -m pytest -n 2 -m 'not slow'
 
-test-all: check
+test-all: check docs
 	@$(PYTHON) -m pip install -qq -c constraints.txt 'dapdata[interop]' # what reads exports; dapdata itself is there already
 	$(PYTHON) -m pytest -n 2
 
@@ -57,6 +57,10 @@ check: env
 
 schemas: env
 	@$(PYTHON) docs/make.py
+
+docs: env
+	@$(PYTHON) -c 'import material' 2>/dev/null || $(PYTHON) -m pip install -qq -c constraints.txt -e '.[docs]'
+	$(PYTHON) docs/build_site.py
 
 clean:
 	@rm -rf .venv build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -100,10 +100,10 @@ def render(
     """
     parts = [
         _header(manifest, index, form),
-        f"# {manifest['name']}\n\n{summary(manifest, demos, index)}\n",
+        f"# {manifest['name']}\n\n{summary(manifest, demos, _here(index))}\n",
         "".join(f"![{_alt(path)}]({path})\n" for path in previews),
         *([f"## Read it\n\n{form.loader}", _averages(index), _splits(index)] if index else [UNLABELLED]),
-        _rejects(manifest["rejects"]),
+        _rejects(manifest["rejects"], manifest["missing"]),
         FRAMES,
         f"## Files\n\n{form.files}\n",
         *([f"## Arrays\n\n{_table(ARRAYS_HEAD, _arrays())}"] if form.has_arrays else []),
@@ -118,20 +118,29 @@ def render(
 UNLABELLED = "No shards yet: run `dapdata label` on this folder.\n"
 
 
-def summary(manifest: Mapping[str, Any], demos: int, index: Mapping[str, Array]) -> str:
-    """What the dataset is, in a sentence or two; arguments as in `render`."""
+def summary(manifest: Mapping[str, Any], demos: int, here: int) -> str:
+    """What the dataset is, in a sentence or two.
+
+    Args:
+        manifest: As JSON data.
+        demos: How many are in the shards.
+        here: How many of them are beside the text; 0 before the dataset is labelled.
+    """
     what = (
         f"Demonstrations of placing an object into a container, task `{manifest['task']}`, made in simulation by dapdata "
         f"{manifest['created_by']['dapdata']}"
     )
-    if not index:
+    if not here:
         return f"{what}: {manifest['demos']} demos, not yet labelled."
-    here = len(index["demo"])
     return (
         f"{what}: {here if here == demos else f'{here} of {demos}'} demos, each with noisy point clouds of container and "
         "object, superpoints, every goal that holds in physics, and the affordance and correspondence labels of the "
         "demonstrated one."
     )
+
+
+def _here(index: Mapping[str, Array]) -> int:
+    return len(index["demo"]) if index else 0
 
 
 def citation(manifest: Mapping[str, Any]) -> str:
@@ -148,7 +157,7 @@ def citation(manifest: Mapping[str, Any]) -> str:
 
 
 def _header(manifest: Mapping[str, Any], index: Mapping[str, Array], form: Form) -> str:
-    here = len(index["demo"]) if index else 0
+    here = _here(index)
     size = next((text for limit, text in SIZES if here < limit), "n>1M")
     lines = [f"license: {LICENSE}", "task_categories:", "- robotics", "tags:", *(f"- {tag}" for tag in TAGS)]
     lines += [f"pretty_name: {manifest['name']}", "size_categories:", f"- {size}"]
@@ -201,13 +210,16 @@ def _splits(index: Mapping[str, Array]) -> str:
     return f"## Splits\n\n{_table(head, lines)}\n{proof}{spare}\n"
 
 
-def _rejects(rejects: Mapping[str, Mapping[str, int]]) -> str:
+def _rejects(rejects: Mapping[str, Mapping[str, int]], missing: Sequence[Mapping[str, Any]]) -> str:
     words = {
         "attempts": "scenes given up (another was drawn instead)",
         "demos": "demos left out",
         "goals": "candidate goals that did not hold (kept in `rejected_goals/`)",
     }
     lines = [(words[what], reason, count) for what, counts in rejects.items() for reason, count in counts.items()]
+    for entry in missing:
+        start, stop = entry["demo_range"]
+        lines.append((f"demos {start} to {stop - 1}, which could not be made", entry["reason"].replace("|", "/"), stop - start))
     return "## What was rejected\n\n" + (_table(["what", "reason", "count"], lines) if lines else "Nothing.\n")
 
 

@@ -66,7 +66,33 @@ Workers = Annotated[
     _option("--workers", help="Processes that work at the same time", default="one for each core", min=1, metavar="W"),
 ]
 Engine = Annotated[
-    str, typer.Option("--engine", help="Where they work: local, or inline: in this process, one after the other.")
+    str,
+    typer.Option(
+        "--engine",
+        help="Where they work: local; ray, or ray://HOST:PORT, on a Ray cluster; inline: in this process, one after the other.",
+    ),
+]
+Memory = Annotated[
+    float | None,
+    _option(
+        "--memory",
+        help="Memory that each of them may take; a unit that takes more has failed",
+        default="an equal part of 80 % of what there is",
+        min=0.1,
+        metavar="GB",
+    ),
+]
+Units = Annotated[
+    str | None,
+    _option(
+        "--units",
+        help="Make every N-th unit, from the I-th on (from 0); other tasks make the others at the same time",
+        default="all units",
+        metavar="I/N",
+    ),
+]
+AllowMissing = Annotated[
+    bool, typer.Option("--allow-missing", help="Publish the others when units have failed; the manifest names what is missing.")
 ]
 Device = Annotated[str, typer.Option("--device", help="auto, cpu, cuda or cuda:N.")]
 Minutes = Annotated[
@@ -186,6 +212,9 @@ def generate(
     demos: Demos = None,
     workers: Workers = None,
     engine: Engine = "local",
+    memory: Memory = None,
+    units: Units = None,
+    allow_missing: AllowMissing = False,
     overrides: Overrides = None,
     dry_run: DryRun = False,
     fresh: Fresh = False,
@@ -199,13 +228,16 @@ def generate(
         made = pipeline.generate(
             asked,
             out,
-            workers=_count(workers),
+            workers=workers,
             engine=engine,
+            memory=memory,
+            units=units,
+            allow_missing=allow_missing,
             fresh=fresh,
             dry_run=dry_run,
             progress=None if dry_run else advance,
         )
-    _show_made(made, as_json)
+    _show_made(made, as_json, units)
 
 
 @app.command(epilog="Example: dapdata label data/can_cabinet --set label.eps_place=0.02")
@@ -213,6 +245,9 @@ def label(
     dataset: LastDataset = None,
     workers: Workers = None,
     engine: Engine = "local",
+    memory: Memory = None,
+    units: Units = None,
+    allow_missing: AllowMissing = False,
     overrides: Overrides = None,
     dry_run: DryRun = False,
     as_json: Json = False,
@@ -225,14 +260,43 @@ def label(
         made = pipeline.label(
             folder,
             overrides or (),
-            workers=_count(workers),
+            workers=workers,
             engine=engine,
+            memory=memory,
+            units=units,
+            allow_missing=allow_missing,
             dry_run=dry_run,
             progress=None if dry_run else advance,
         )
-    if not dry_run:
+    if not dry_run and units is None:  # pictures need the dataset's lock, which tasks share
         _draw_previews(made)
-    _show_made(made, as_json)
+    _show_made(made, as_json, units)
+
+
+@app.command(epilog="Example: dapdata slurm recipes/can_cabinet.yaml --tasks 20 > can_cabinet.sh; bash can_cabinet.sh")
+def slurm(
+    recipe: RecipeFile,
+    out: Out = None,
+    demos: Demos = None,
+    tasks: Annotated[
+        int | None,
+        _option("--tasks", help="Most tasks of an array job", default="100, or one for each unit", min=1, metavar="N"),
+    ] = None,
+    workers: Annotated[int, typer.Option("--workers", help="Cores and processes of each task.", min=1, metavar="W")] = 1,
+    memory: Annotated[float, typer.Option("--memory", help="Memory of each process.", min=0.5, metavar="GB")] = 2.0,
+    time: Annotated[str, typer.Option("--time", help="Time limit of each task.", metavar="HH:MM:SS")] = "04:00:00",
+    partition: Annotated[str | None, _option("--partition", help="Partition", default="the cluster's", metavar="P")] = None,
+    account: Annotated[str | None, _option("--account", help="Account", default="yours", metavar="A")] = None,
+    overrides: Overrides = None,
+    allow_missing: AllowMissing = False,
+) -> None:
+    """Print a script that submits generate and label to Slurm as array jobs. Nothing is submitted by this command."""
+    from dapdata.slurm import Limits, script
+
+    asked = _recipe(recipe, overrides, demos)
+    changes = [*(overrides or ()), *([f"demos={demos}"] if demos is not None else [])]
+    limits = Limits(tasks, workers, memory, time, partition, account)
+    print(script(asked, recipe, out, changes, limits, allow_missing), end="")
 
 
 @app.command(epilog="Example: dapdata status data/can_cabinet --json")
@@ -281,15 +345,25 @@ def gc(dataset: LastDataset = None, dry_run: DryRun = False, as_json: Json = Fal
 @app.command("show", epilog="Example: dapdata show data/can_cabinet --out cabinet.html")
 def show_dataset(
     dataset: LastDataset = None,
-    out: Annotated[Path | None, _option("--out", help="A .png or .html file", default="both, named after the dataset")] = None,
+    out: Annotated[
+        Path | None,
+        _option("--out", help="A .png or .html file, with --rerun an .rrd file", default="both, named after the dataset"),
+    ] = None,
     demo: Annotated[list[int] | None, _option("--demo", help="Number of a demo to show; may be repeated", min=0)] = None,
     count: Annotated[int, typer.Option("--count", min=1, max=64, help="How many demos, if none is named.")] = 4,
+    rerun: Annotated[bool, typer.Option("--rerun", help="Stream to the rerun viewer, or with --out to an .rrd file.")] = False,
     as_json: Json = False,
 ) -> None:
     """Draw a contact sheet (PNG) and a page with a 3-D view (HTML)."""
-    from dapdata.show import contact_sheet, show_html
+    from dapdata.show import contact_sheet, show_html, show_rerun
 
     folder = last("dataset", dataset)
+    if rerun:
+        if out is not None and out.suffix != ".rrd":
+            raise UsageError(f"--out {out}: expected an .rrd file with --rerun, or no --out for the viewer")
+        shown = show_rerun(folder, out, demo, count)
+        show({"files": [str(shown)] if shown else []}, as_json, str(shown or "shown in the rerun viewer"))
+        return
     targets = [out] if out is not None else [Path(f"{_name(folder)}{suffix}") for suffix in (".png", ".html")]
     if any(target.suffix not in (".png", ".html") for target in targets):
         raise UsageError(f"--out {out}: expected a .png or .html file")
@@ -424,12 +498,20 @@ def judge(
 def compare(
     a: Annotated[Path, typer.Argument(help="report.json of one method.")],
     b: Annotated[Path, typer.Argument(help="report.json of another, on the same scenes.")],
+    out: Annotated[Path | None, _option("--out", help="Page to write, an .html file", metavar="FILE")] = None,
     as_json: Json = False,
 ) -> None:
     """Compare two reports scene by scene. With McNemar's paired test."""
     from dapdata.report import compare as compare_reports
 
+    if out is not None and out.suffix != ".html":
+        raise UsageError(f"--out {out}: expected an .html file")
     found = compare_reports(a, b)
+    if out is not None:
+        from daptrain.page import comparison_page
+
+        out.parent.mkdir(parents=True, exist_ok=True)
+        out.write_text(comparison_page(a, b), encoding="utf-8")
     show(found, as_json, comparison_text(found))
 
 
@@ -475,6 +557,8 @@ def run(
     k: K = None,
     workers: Workers = None,
     engine: Engine = "local",
+    memory: Memory = None,
+    allow_missing: AllowMissing = False,
     device: Device = "auto",
     overrides: Overrides = None,
     fresh: Fresh = False,
@@ -483,7 +567,7 @@ def run(
     """Generate, label, train and eval. Then say how well it went and where everything is."""
     from dapdata import pipeline
 
-    _need("sim", "pybullet", "numba", "pebble", "matplotlib")
+    _need("sim", "pybullet", "numba", "matplotlib")
     _need("train", "torch")
     from daptrain import evaluate as evaluate_run
     from daptrain import train as train_networks
@@ -491,11 +575,11 @@ def run(
 
     check_budget(minutes, None)
     asked = _recipe(recipe, overrides, demos)
+    means: dict[str, Any] = {"workers": workers, "engine": engine, "memory": memory, "allow_missing": allow_missing}
     with progress("generate", "demo") as advance:
-        made = pipeline.generate(asked, out, workers=_count(workers), engine=engine, fresh=fresh, progress=advance)
-        dataset = str(made)
+        dataset = str(pipeline.generate(asked, out, fresh=fresh, progress=advance, **means))
     with progress("label", "demo") as advance:
-        pipeline.label(dataset, workers=_count(workers), engine=engine, progress=advance)
+        pipeline.label(dataset, progress=advance, **means)
     _draw_previews(dataset)
     remember(dataset=dataset)
     target = run_folder or Path("runs") / _name(dataset)
@@ -583,6 +667,20 @@ def _export(kind: str, dataset: str | None, out: Path, as_json: bool, **options:
 
 
 # Around ----------------------------------------------------------------------------------------------------
+
+
+@app.command(epilog="Example: dapdata doctor --out /data/mine --extra sim")
+def doctor(
+    out: Annotated[Path, typer.Option("--out", help="Where datasets are to be written.", metavar="DIR")] = Path("data"),
+    extra: Annotated[list[str] | None, _option("--extra", help="An extra that must be there; may be repeated")] = None,
+    as_json: Json = False,
+) -> int:
+    """Say what is installed, what the machine offers, and what to do about what is missing."""
+    from dapdata.doctor import examine
+
+    found = examine(out, extra or ())
+    show(found.to_dict(), as_json, str(found))
+    return 0 if found.ok else 6
 
 
 @app.command(epilog="Example: dapdata bench --scale quick")
@@ -676,10 +774,11 @@ def _draw_previews(dataset: Any) -> None:
         pipeline.attach(dataset, preview(dataset))
 
 
-def _show_made(made: Any, as_json: bool) -> None:
+def _show_made(made: Any, as_json: bool, units: str | None) -> None:
     """Shows the dataset's folder or URL, or the plan."""
     if isinstance(made, str | Path):
-        remember(dataset=made)
+        if units is None:
+            remember(dataset=made)
         show({"dataset": str(made)}, as_json, str(made))
     else:
         show(made.to_dict(), as_json, str(made))

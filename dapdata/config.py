@@ -67,7 +67,14 @@ class SplitConfig(Section):
     """How demos are shared out; by container and object instance, so that no instance is in two splits."""
 
     val: float = key(0.1, "share of the demos on which choices are made", ge=0, le=0.5)
-    test: float = key(0.1, "share of the demos that are looked at once", ge=0, le=0.5)
+    test: float = key(0.1, "share of the demos that are looked at once; 1: a benchmark's scenes, none to train on", ge=0, le=1)
+
+    @model_validator(mode="after")
+    def check_shares(self) -> SplitConfig:
+        """No demo is in two splits."""
+        if self.val + self.test > 1:
+            raise ValueError(f"test: got {self.test} beside val {self.val}, expected no more than 1 together; lower one")
+        return self
 
 
 # What `preset: paper` changes: the method as published, on the same networks. A key written in the recipe wins.

@@ -13,11 +13,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from hashlib import sha256
+from pathlib import Path
 from typing import Any
 
-from dapdata import card
-from dapdata.records import Array, columns, is_ragged
+from dapdata import card, durable
+from dapdata.records import columns, is_ragged
+from dapdata.tables import Index
 
 CONTEXT = {
     "@language": "en",
@@ -72,21 +73,20 @@ SENTENCES = {  # columns of the index whose name does not say it all
 ABOUT_ARRAYS = ("path", "dtype", "shape", "unit", "frame", "description", "codes")
 
 
-def render(manifest: Mapping[str, Any], folders: Sequence[str], index: Mapping[str, Array], index_file: bytes) -> bytes:
+def render(manifest: Mapping[str, Any], folders: Sequence[str], index: Index) -> bytes:
     """The description as JSON.
 
     Args:
         manifest: As JSON data, of a labelled dataset; its shards and stages are not looked at.
         folders: Where the shards are.
-        index: Its columns.
-        index_file: The same as a Parquet file.
+        index: Of all demos; its columns are not read.
     """
     tree = {
         "@context": CONTEXT,
         "@type": "sc:Dataset",
         "conformsTo": "http://mlcommons.org/croissant/1.0",
         "name": manifest["name"],
-        "description": card.summary(manifest, len(index["demo"]), index),
+        "description": card.summary(manifest, index.rows, index.rows),
         "license": card.LICENSE_URL,
         "citeAs": card.citation(manifest),
         "creator": {"@type": "sc:Organization", "name": "dapdata"},
@@ -96,13 +96,13 @@ def render(manifest: Mapping[str, Any], folders: Sequence[str], index: Mapping[s
         "rai:dataCollectionType": "Software Collection",
         "rai:dataLimitation": "Ideal solids without texture; modelled depth noise; one object; containers do not move.",
         "rai:personalSensitiveInformation": "None: nothing in it was recorded.",
-        "distribution": _distribution(folders, index_file),
+        "distribution": _distribution(folders, index.path),
         "recordSet": [_demos(index), _arrays()],
     }
     return json.dumps(tree, indent=1, ensure_ascii=False).encode() + b"\n"
 
 
-def _distribution(folders: Sequence[str], index_file: bytes) -> list[dict[str, Any]]:
+def _distribution(folders: Sequence[str], index_file: Path) -> list[dict[str, Any]]:
     return [
         {
             "@type": "cr:FileObject",
@@ -110,9 +110,9 @@ def _distribution(folders: Sequence[str], index_file: bytes) -> list[dict[str, A
             "name": INDEX,
             "description": "One row per demo: where it is, its split, instances and counts.",
             "contentUrl": INDEX,
-            "contentSize": f"{len(index_file)} B",
+            "contentSize": f"{index_file.stat().st_size} B",
             "encodingFormat": "application/x-parquet",
-            "sha256": sha256(index_file).hexdigest(),
+            "sha256": durable.hash_file(index_file),
         },
         {
             "@type": "cr:FileSet",
@@ -125,7 +125,7 @@ def _distribution(folders: Sequence[str], index_file: bytes) -> list[dict[str, A
     ]
 
 
-def _demos(index: Mapping[str, Array]) -> dict[str, Any]:
+def _demos(index: Index) -> dict[str, Any]:
     """The index as a record set."""
     fields = [
         {
@@ -133,10 +133,10 @@ def _demos(index: Mapping[str, Array]) -> dict[str, Any]:
             "@id": f"demos/{name}",
             "name": name,
             "description": SENTENCES.get(name, name.replace("_", " ")),
-            "dataType": "sc:Text" if column.dtype.kind == "U" else "sc:Integer",
+            "dataType": "sc:Integer" if name in index.numbers else "sc:Text",
             "source": {"fileObject": {"@id": INDEX}, "extract": {"column": name}},
         }
-        for name, column in index.items()
+        for name in index
     ]
     return {"@type": "cr:RecordSet", "@id": "demos", "name": "demos", "key": {"@id": "demos/demo"}, "field": fields}
 

@@ -1,13 +1,13 @@
 """Pictures of point clouds and solids in plain numpy: no GPU, no window, no plotting library.
 
-Points become small discs that lie in their tangent plane, solids are met by one ray a pixel, and both
+Points become small discs that lie in their tangent plane, solids are triangles (`triangulate`), and both
 share one depth buffer. Everything is drawn at twice the wanted size and averaged down; a shade by depth
 differences ("eye-dome lighting") makes shapes readable where colours carry data.
 
     camera = frame(points, direction=(1, -0.3, 0.5), width=640, height=480)
     canvas = blank(camera)
     draw_cloud(canvas, points, colors, normals)
-    draw_solids(canvas, kind, size, T_world_part, colors)
+    draw_solids(canvas, triangulate(kind, size, T_world_part), colors)
     pixels = image(canvas)  # (480, 640, 3) uint8
 
 Matplotlib's own 3-D scatter was tried first: it sorts whole artists instead of pixels, so clouds and
@@ -24,6 +24,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from dapdata.solids import to_trimesh
+
 Array = NDArray[Any]
 
 OVERSAMPLE = 2  # pixels drawn per pixel shown, each way
@@ -33,7 +35,7 @@ POINT_RADIUS = 0.0072  # m: a little less than the pitch of the fused clouds, so
 DEPTH_SHADE = 25.0  # strength of the shade by depth differences, per relative depth step
 LIGHT = np.array([-0.45, -0.65, -0.61])  # camera frame, unit, toward the light: over the viewer's left shoulder
 BACKGROUND = (1.0, 1.0, 1.0)
-BOX, CYLINDER, ELLIPSOID, MESH = range(4)  # as records.PART_KINDS
+CREASE = np.radians(30)  # faces of one solid that meet at more than this have a line between them
 
 
 @dataclass(frozen=True)
@@ -149,9 +151,7 @@ def splat(camera: Camera, points: Array, normals: Array | None, radius: float) -
     ahead = np.flatnonzero(centre[:, 2] > 0.02)
     centre = centre[ahead]
     normal = -centre if normals is None else (normals[ahead] @ T[:3, :3]).astype(np.float32)
-    none = np.iinfo(np.uint64).max
-    key = np.full(camera.height * camera.width, none, np.uint64)
-    name = ahead.astype(np.uint64)
+    found: list[tuple[Array, Array, Array]] = [(np.zeros(0, int), np.zeros(0, np.float32), np.zeros(0, int))]
     x, y, z = centre.T
     across, down, along = normal.T
     u = np.floor(x / z * camera.focal + camera.width / 2).astype(np.int32)
@@ -168,12 +168,9 @@ def splat(camera: Camera, points: Array, normals: Array | None, radius: float) -
         if abs(du) + abs(dv) <= 1:  # a disc seen edge-on still fills a pixel or two
             at, near = np.where(near, at, z), np.ones_like(near)
         hit = np.flatnonzero(near & (pu >= 0) & (pu < camera.width) & (pv >= 0) & (pv < camera.height) & (at > 0))
-        depth_bits = at[hit].astype(np.float32).view(np.uint32).astype(np.uint64) << np.uint64(32)
-        np.minimum.at(key, pv[hit] * camera.width + pu[hit], depth_bits | name[hit])
-    nearest = key.reshape(camera.height, camera.width)
-    empty = nearest == none
-    depth = np.where(empty, np.inf, (nearest >> np.uint64(32)).astype(np.uint32).view(np.float32)).astype(np.float32)
-    return np.where(empty, -1, (nearest & np.uint64(0xFFFFFFFF)).astype(np.int64)), depth
+        found.append((pv[hit] * camera.width + pu[hit], at[hit], ahead[hit]))
+    pixel, depth, name = (np.concatenate(column) for column in zip(*found))
+    return _nearest(pixel, depth, name, (camera.height, camera.width))
 
 
 def draw_ground(canvas: Canvas, center: ArrayLike, radius: float, pitch: float = 0.1) -> None:
@@ -199,57 +196,140 @@ def rays(camera: Camera, left: int, right: int, top: int, bottom: int) -> Array:
     return np.stack([*np.meshgrid(x, y), np.ones((bottom - top, right - left))], axis=-1)
 
 
+@dataclass(frozen=True)
+class Triangles:
+    """Solids as triangles."""
+
+    vertices: Array  # (V, 3), m
+    faces: Array  # (F, 3) vertices, counterclockwise seen from outside
+    part: Array  # (F,) which solid each is of
+
+    def at(self, T: Array) -> Triangles:
+        """The same solids at each of (G, 4, 4) poses: part p at pose g becomes part g * P + p."""
+        vertices = self.vertices @ T[:, :3, :3].transpose(0, 2, 1) + T[:, None, :3, 3]
+        step = np.arange(len(T))[:, None]
+        parts = int(self.part.max(initial=-1)) + 1
+        faces = self.faces + step[..., None] * len(self.vertices)
+        return Triangles(vertices.reshape(-1, 3), faces.reshape(-1, 3), (self.part + step * parts).ravel())
+
+
+def triangulate(kind: Array, size: Array, T: Array, *, sections: int = 64) -> Triangles:
+    """The triangles of P parts: the one place where pictures and 3-D views learn what a part looks like.
+
+    Args:
+        kind: (P,) index into records.PART_KINDS.
+        size: (P, 3) full extents, m.
+        T: (P, 4, 4) in the frame that the triangles shall be in.
+        sections: Sides of a cylinder.
+    """
+    meshes = [to_trimesh(kind[p : p + 1], size[p : p + 1], T[p : p + 1], sections) for p in range(len(kind))]
+    first = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
+    return Triangles(
+        np.concatenate([np.zeros((0, 3)), *(mesh.vertices for mesh in meshes)]),
+        np.concatenate([np.zeros((0, 3), int), *(mesh.faces + start for mesh, start in zip(meshes, first))]),
+        np.repeat(np.arange(len(meshes)), [len(mesh.faces) for mesh in meshes]),
+    )
+
+
 def draw_solids(
     canvas: Canvas,
-    kind: Array,
-    size: Array,
-    T_world_part: Array,
+    solids: Triangles,
     colors: ArrayLike,
     opacity: float = 1.0,
     hidden: float = 0.0,
     edge: float = 0.55,
 ) -> None:
-    """Adds boxes, cylinders and ellipsoids to a canvas; meshes are left out.
-
-    The solids of one call hide each other; against what is on the canvas already they are blended.
+    """Adds solids to a canvas. Those of one call hide each other; against what is there already they are blended.
 
     Args:
         canvas: Changed in place.
-        kind: (P,) index into records.PART_KINDS.
-        size: (P, 3) full extents, m.
-        T_world_part: (P, 4, 4).
-        colors: (P, 3) in [0, 1], or (3,) for all.
+        solids: World frame.
+        colors: (P, 3) in [0, 1], one a part, or (3,) for all.
         opacity: Of faces in front of what is there; at 1 they hide it.
         hidden: Opacity of faces behind what is there: above 0 they shine through.
         edge: Opacity, on top of that, of the lines where faces meet and where a solid ends.
     """
-    colors = np.broadcast_to(np.asarray(colors, float), (len(kind), 3))
-    depth = np.full_like(canvas.depth, np.inf)
-    face = np.full(canvas.depth.shape, -1, np.int32)
-    color = np.zeros_like(canvas.color)
-    light = to_light(canvas.camera)
-    for part in np.flatnonzero(kind != MESH):
-        hit = cast(canvas.camera, int(kind[part]), np.asarray(size[part], float), T_world_part[part])
-        if hit is None:
-            continue
-        window, z, side, normal = hit
-        near = z < depth[window]
-        depth[window][near] = z[near]
-        face[window][near] = part * 8 + side[near]
-        bright = 0.74 + 0.30 * (normal[near] @ (T_world_part[part, :3, :3].T @ light))
-        color[window][near] = np.clip(colors[part] * bright[:, None], 0, 1)
-    _blend(canvas, color, depth, _outline(face), opacity, hidden, edge)
+    if not len(solids.faces):
+        return
+    corners = solids.vertices[solids.faces]
+    seen, depth = cast(canvas.camera, corners)
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    color = np.broadcast_to(np.asarray(colors, float), (int(solids.part.max(initial=0)) + 1, 3))[solids.part]
+    shaded = np.clip(color * (0.74 + 0.30 * normals @ to_light(canvas.camera))[:, None], 0, 1)
+    line = _outline(seen, solids.part, normals)
+    layer = np.zeros_like(canvas.color)
+    layer[seen >= 0] = shaded[seen[seen >= 0]]
+    _blend(canvas, layer, depth, line, opacity, hidden, edge)
 
 
-def _outline(face: Array) -> Array:
-    """(H, W) bool: pixels of a solid next to a pixel of another face, solid or of none."""
-    line = np.zeros(face.shape, bool)
-    across, down = face[:, 1:] != face[:, :-1], face[1:] != face[:-1]
-    line[:, 1:] |= across
-    line[:, :-1] |= across
-    line[1:] |= down
-    line[:-1] |= down
-    return line & (face >= 0)
+def cast(camera: Camera, corners: Array) -> tuple[Array, Array]:
+    """Which of (F, 3, 3) triangles each pixel sees, (H, W) int, -1 for none, and at what depth, (H, W) m, inf for none.
+
+    Triangles that reach behind the camera are left out.
+    """
+    T = camera.T_world_camera
+    local = (corners - T[:3, 3]) @ T[:3, :3]
+    ahead = np.flatnonzero(local[..., 2].min(axis=1, initial=np.inf) > 0.02)
+    local = local[ahead]
+    uv = local[..., :2] / local[..., 2:] * camera.focal + [camera.width / 2, camera.height / 2]
+    triangle, row = _spread(uv[..., 1].min(axis=1), uv[..., 1].max(axis=1), camera.height)
+    # Where the middle of a row of pixels crosses the three sides: all pixels in between are inside.
+    left, right = np.full(len(row), np.inf), np.full(len(row), -np.inf)
+    for a, b in ((0, 1), (1, 2), (2, 0)):
+        (ua, va), (ub, vb) = uv[triangle, a].T, uv[triangle, b].T
+        with np.errstate(divide="ignore", invalid="ignore"):
+            share = (row + 0.5 - va) / (vb - va)
+        u, crossed = ua + share * (ub - ua), (share >= 0) & (share <= 1)
+        left = np.where(crossed, np.minimum(left, u), left)
+        right = np.where(crossed, np.maximum(right, u), right)
+    span, column = _spread(left, right, camera.width)
+    triangle, row = triangle[span], row[span]
+    normal = np.cross(local[:, 1] - local[:, 0], local[:, 2] - local[:, 0])
+    level = (normal * local[:, 0]).sum(axis=1)
+    ray_x, ray_y = (column + (0.5 - camera.width / 2)) / camera.focal, (row + (0.5 - camera.height / 2)) / camera.focal
+    across, down, along, level, near, far = np.c_[normal, level, local[..., 2].min(axis=1), local[..., 2].max(axis=1)].T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        z = level[triangle] / (across[triangle] * ray_x + down[triangle] * ray_y + along[triangle])
+    # Seen edge-on, a triangle covers pixels whose rays miss it: it is nowhere else than between its corners.
+    z = np.clip(z, near[triangle], far[triangle])
+    return _nearest(row * camera.width + column, z, ahead[triangle], (camera.height, camera.width))
+
+
+def _spread(low: Array, high: Array, size: int) -> tuple[Array, Array]:
+    """Every pixel whose middle lies in one of N intervals: the number of the interval, and that of the pixel."""
+    first = np.ceil(np.clip(low, 0, size) - 0.5).astype(np.int32)
+    past = np.floor(np.clip(high, 0, size) - 0.5).astype(np.int32) + 1
+    count = np.maximum(past - first, 0)
+    interval = np.repeat(np.arange(len(count)), count)
+    return interval, np.arange(len(interval)) - (np.cumsum(count) - count - first)[interval]
+
+
+def _nearest(pixel: Array, depth: Array, name: Array, shape: tuple[int, int]) -> tuple[Array, Array]:
+    """Of (N,) things at pixels the nearest each: its name, (H, W) int, -1 for none, and its depth, (H, W) m, inf for none."""
+    none = np.iinfo(np.uint64).max
+    key = np.full(shape[0] * shape[1], none, np.uint64)
+    depth_bits = depth.astype(np.float32).view(np.uint32).astype(np.uint64) << np.uint64(32)
+    np.minimum.at(key, pixel, depth_bits | name.astype(np.uint64))
+    nearest = key.reshape(shape)
+    empty = nearest == none
+    found = np.where(empty, np.inf, (nearest >> np.uint64(32)).astype(np.uint32).view(np.float32)).astype(np.float32)
+    return np.where(empty, -1, (nearest & np.uint64(0xFFFFFFFF)).astype(np.int64)), found
+
+
+def _outline(seen: Array, part: Array, normals: Array) -> Array:
+    """(H, W) bool: pixels of a solid next to one of another solid, of none, or where the surface has an edge."""
+    line = np.zeros(seen.shape, bool)
+    before, after = slice(None, -1), slice(1, None)
+    for one, other in (((..., before), (..., after)), ((before,), (after,))):
+        a, b = seen[one], seen[other]
+        border = a != b
+        a, b = a[border], b[border]
+        smooth = (a >= 0) & (b >= 0) & (part[a] == part[b]) & ((normals[a] * normals[b]).sum(axis=1) > np.cos(CREASE))
+        border[border] = ~smooth
+        line[one] |= border
+        line[other] |= border
+    return line & (seen >= 0)
 
 
 def _blend(canvas: Canvas, color: Array, depth: Array, line: Array, opacity: float, hidden: float, edge: float) -> None:
@@ -264,84 +344,15 @@ def _blend(canvas: Canvas, color: Array, depth: Array, line: Array, opacity: flo
     canvas.depth[solid] = depth[solid]
 
 
-def cast(camera: Camera, kind: int, size: Array, T_world_part: Array) -> tuple[Any, Array, Array, Array] | None:
-    """Where the camera's rays first meet one solid.
-
-    Returns:
-        The window of the picture that can see it (a pair of slices), and in that window depth (m, inf for a
-        miss), the number of the face and the normal in the part's frame; None if it is out of sight.
-    """
-    T = camera.T_world_camera
-    corners = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T * size / 2
-    seen = (corners @ T_world_part[:3, :3].T + T_world_part[:3, 3] - T[:3, 3]) @ T[:3, :3]
-    if seen[:, 2].min() < 0.02:
-        return None
-    uv = seen[:, :2] / seen[:, 2:] * camera.focal + [camera.width / 2, camera.height / 2]
-    left, top = np.clip(np.floor(uv.min(axis=0)).astype(int), 0, [camera.width, camera.height])
-    right, bottom = np.clip(np.ceil(uv.max(axis=0)).astype(int), 0, [camera.width, camera.height])
-    if left >= right or top >= bottom:
-        return None
-    R = T[:3, :3].T @ T_world_part[:3, :3]  # part to camera; row vectors times it go the other way
-    origin = (T[:3, 3] - T_world_part[:3, 3]) @ T_world_part[:3, :3]
-    ray = rays(camera, left, right, top, bottom) @ R
-    with np.errstate(divide="ignore", invalid="ignore"):
-        z, side, normal = (_meet_box, _meet_cylinder, _meet_ellipsoid)[kind](origin, ray, size / 2)
-    return (slice(top, bottom), slice(left, right)), z, side, normal
-
-
-def _slabs(origin: Array, ray: Array, half: Array) -> tuple[Array, Array]:
-    """Entry and exit along the ray for each axis' slab, both (..., axes)."""
-    ray = np.where(np.abs(ray) < 1e-12, 1e-12, ray)
-    a, b = (-half - origin) / ray, (half - origin) / ray
-    return np.minimum(a, b), np.maximum(a, b)
-
-
-def _meet_box(origin: Array, ray: Array, half: Array) -> tuple[Array, Array, Array]:
-    enter, leave = _slabs(origin, ray, half)
-    z, out = enter[..., 0], leave[..., 0]
-    axis = np.zeros(z.shape, int)
-    for k in (1, 2):  # several times faster than reducing over an axis of three
-        axis = np.where(enter[..., k] > z, k, axis)
-        z, out = np.maximum(z, enter[..., k]), np.minimum(out, leave[..., k])
-    z = np.where((z < out) & (z > 0), z, np.inf)
-    positive = np.choose(axis, [ray[..., k] < 0 for k in range(3)])
-    side = axis * 2 + positive
-    return z, side, np.repeat(np.eye(3), 2, axis=0)[side] * np.where(positive, 1, -1)[..., None]
-
-
-def _meet_cylinder(origin: Array, ray: Array, half: Array) -> tuple[Array, Array, Array]:
-    o, d = origin[:2] / half[:2], ray[..., :2] / half[:2]
-    a, b, c = (d * d).sum(-1), (d * o).sum(-1), (o * o).sum() - 1
-    root = np.sqrt(b * b - a * c)
-    enter, leave = _slabs(origin[2:], ray[..., 2:], half[2:])
-    side_in, side_out = (-b - root) / a, (-b + root) / a
-    z = np.maximum(side_in, enter[..., 0])
-    z = np.where((z < np.minimum(side_out, leave[..., 0])) & (z > 0), z, np.inf)
-    cap = enter[..., 0] > side_in
-    at = (origin[:2] + np.where(np.isfinite(z), z, 0)[..., None] * ray[..., :2]) / half[:2]
-    round_normal = np.concatenate([at, np.zeros_like(at[..., :1])], axis=-1)
-    normal = np.where(cap[..., None], -np.sign(ray[..., 2:]) * np.array([0, 0, 1.0]), round_normal)
-    return z, cap.astype(int), normal
-
-
-def _meet_ellipsoid(origin: Array, ray: Array, half: Array) -> tuple[Array, Array, Array]:
-    o, d = origin / half, ray / half
-    a, b, c = (d * d).sum(-1), (d * o).sum(-1), (o * o).sum() - 1
-    z = (-b - np.sqrt(b * b - a * c)) / a
-    z = np.where(z > 0, z, np.inf)
-    normal = (o + np.where(np.isfinite(z), z, 0)[..., None] * d) / half
-    return z, np.zeros(z.shape, int), normal / np.linalg.norm(normal, axis=-1, keepdims=True)
-
-
 def image(canvas: Canvas) -> Array:
     """(height, width, 3) uint8: the finished picture, shaded by depth and averaged down."""
-    shaded = canvas.color * _depth_shade(canvas.depth)[..., None]
+    shaded = canvas.color * depth_shade(canvas.depth)[..., None]
     steps = range(OVERSAMPLE)
     small = sum(shaded[i::OVERSAMPLE, j::OVERSAMPLE] for i in steps for j in steps) / OVERSAMPLE**2
     return np.asarray(np.round(np.clip(small, 0, 1) * 255), np.uint8)
 
 
-def _depth_shade(depth: Array) -> Array:
+def depth_shade(depth: Array) -> Array:
     """(H, W) in (0, 1]: darker the further a pixel lies behind its neighbours (at two distances)."""
     finite = np.isfinite(depth)
     log = np.log(np.where(finite, depth, 1e3)).astype(np.float32)

@@ -19,11 +19,12 @@ import shutil
 import socket
 import sys
 import tempfile
+import time
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from hashlib import file_digest, sha256
 from pathlib import Path
-from typing import Any, Protocol
+from typing import IO, Any, Protocol
 
 from dapdata.errors import EnvironmentProblem, LockedError
 
@@ -38,13 +39,13 @@ observer: Callable[[str, Path], None] | None = None  # tests set it to see, or t
 class Mirror(Protocol):
     """Repeats elsewhere what is made durable below a folder of this machine."""
 
-    def hold(self) -> AbstractContextManager[None]:
+    def hold(self, shared: bool, deadline: float) -> AbstractContextManager[None]:
         """Keeps other writers away there, as `lock` does here; brings here what they have done until now."""
 
     def commit(self, folder: Path) -> bool:
         """A folder was moved to its place here; False if there is another there already, which is then here too."""
 
-    def replace(self, path: Path, data: bytes) -> None:
+    def replace(self, path: Path) -> None:
         """A file has new bytes."""
 
     def remove(self, path: Path) -> None:
@@ -141,13 +142,19 @@ def commit(folder: Path, target: Path) -> bool:
 def replace_file(path: Path, data: bytes) -> None:
     """Writes a file so that its name holds either the old bytes or the new ones, also after a power cut."""
     make_folder(path.parent)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    temporary = path.with_name(f".{path.name}.{socket.gethostname()}.{os.getpid()}.tmp")
     temporary.write_bytes(data)
-    _fsync(temporary)
-    _rename(temporary, path)
-    _fsync(path.parent)
-    if mirror := mirror_of(path):
-        mirror.replace(path, data)
+    move_file(temporary, path)
+
+
+def move_file(source: Path, target: Path) -> None:
+    """Moves a file to its place for good, in the place of what has that name."""
+    make_folder(target.parent)
+    _fsync(source)
+    _rename(source, target)
+    _fsync(target.parent)
+    if mirror := mirror_of(target):
+        mirror.replace(target)
 
 
 def remove_file(path: Path) -> None:
@@ -172,10 +179,18 @@ def discard(root: Path, path: Path) -> None:
 
 
 def sweep(root: Path) -> None:
-    """Removes what killed processes left in staging and half-written names; only under the lock."""
-    shutil.rmtree(root / STAGING, ignore_errors=True)
+    """Removes what killed processes left in staging and half-written names; only under a lock that nobody shares.
+
+    Staging is renamed first: a worker that has not heard yet of its command's end (on another machine it may go on for
+    some seconds) then fails, instead of committing a folder that is half swept.
+    """
+    with suppress(FileNotFoundError):
+        (root / STAGING).rename(root / f".{STAGING}.{socket.gethostname()}.{os.getpid()}.tmp")
     for leftover in [*root.glob(TEMPORARY), *root.glob(f"*/{TEMPORARY}")]:
-        leftover.unlink()
+        if leftover.is_dir():
+            shutil.rmtree(leftover, ignore_errors=True)
+        else:
+            leftover.unlink()
 
 
 def this_process() -> str:
@@ -184,40 +199,69 @@ def this_process() -> str:
 
 
 @contextmanager
-def lock(root: Path) -> Iterator[None]:
-    """Holds the dataset for one writer; readers need no lock. The lock dies with its process.
+def lock(root: Path, *, shared: bool = False, patience: float = 0.0) -> Iterator[None]:
+    """Holds the dataset for one writer, or for several that share it; readers need no lock. It dies with its process.
+
+    Those who share it may commit units, which is a rename each and harmless if two make the same one. They neither
+    sweep nor publish.
+
+    Args:
+        root: The dataset's folder.
+        shared: Whether others may hold it at the same time, if they share it too.
+        patience: How long to wait for it, s.
 
     Raises:
-        LockedError: at once, if another process holds it; the message says which.
+        LockedError: if another process holds it; the message says which.
     """
     make_folder(root)
     with (root / ".lock").open("a+") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            file.seek(0)
-            holder = file.read().strip() or "another process"
-            raise LockedError(f"{root}: in use by {holder}; wait for it to end, or stop it, and run again") from error
-        file.truncate(0)
-        file.write(this_process())
+        deadline = time.monotonic() + patience
+        _flock(root, file, fcntl.LOCK_SH if shared else fcntl.LOCK_EX, deadline)
+        mine = f"{this_process()}\n"
+        if not shared:
+            file.truncate(0)
+            sweep(root)
+        file.write(mine)
         file.flush()
-        sweep(root)
         mirror = mirror_of(root)
         try:
-            with mirror.hold() if mirror else nullcontext():
+            with mirror.hold(shared, deadline) if mirror else nullcontext():
                 yield
         finally:
-            sweep(root)
+            if not shared:
+                sweep(root)
+            file.seek(0)
+            others = file.read().replace(mine, "", 1) if shared else ""
             file.truncate(0)
+            file.write(others)
+
+
+def _flock(root: Path, file: IO[str], kind: int, deadline: float) -> None:
+    while True:
+        try:
+            fcntl.flock(file, kind | fcntl.LOCK_NB)
+            return
+        except OSError as error:
+            if error.errno not in (errno.EAGAIN, errno.EACCES):
+                raise EnvironmentProblem(
+                    f"{root}: cannot be locked ({error.strerror}), expected a file system with flock (Lustre: mounted with "
+                    "`flock`); choose another folder with --out"
+                ) from error
+            if time.monotonic() >= deadline:
+                found = holder(root) or "another process"
+                raise LockedError(f"{root}: in use by {found}; wait for it to end, or stop it, and run again") from error
+        time.sleep(0.1)
 
 
 def holder(root: Path) -> str | None:
-    """Who works on the dataset now, as it said itself; None if nobody does."""
+    """Who works on the dataset now, as it said itself; None if nobody does. Those on other machines are believed."""
     try:
-        words = (root / ".lock").read_text()
+        lines = (root / ".lock").read_text().splitlines()
     except OSError:
         return None
-    return words if words and Path("/proc", words.split()[1]).exists() else None
+    here = f" on {socket.gethostname()} ("
+    working = [line for line in lines if here not in line or Path("/proc", line.split()[1]).exists()]
+    return f"{working[0]} and {len(working) - 1} more" if len(working) > 1 else next(iter(working), None)
 
 
 @contextmanager

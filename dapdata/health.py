@@ -7,17 +7,23 @@ wrong becomes a line of its report, never a traceback.
 from __future__ import annotations
 
 import json
+import os
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass
+from itertools import combinations, islice
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from dapdata import durable, manifest, remote, store
 from dapdata.errors import CorruptionError, FormatError
 from dapdata.manifest import Manifest, UnitEntry
-from dapdata.records import Array
-from dapdata.split import SPLITS
+from dapdata.split import SPLITS, distinct
 from dapdata.stages import Layout, units
+from dapdata.tables import Index
 
 OWN_FILES = (manifest.MANIFEST, manifest.PROGRESS, manifest.LOG, ".lock")  # of the machinery, not of the data
 OWN_FOLDERS = (durable.STAGING, "stages", "shards", "quarantine", manifest.PREVIEWS)
@@ -87,7 +93,7 @@ class Audit:
         return "\n".join([head, *(f"  {line}" for line in self.problems), *(f"  note: {line}" for line in self.notes)])
 
 
-@remote.on_copy(units=True)
+@remote.on_copy(units=True, leftovers=True)
 def verify(root: str | Path, *, quick: bool = False, progress: Progress | None = None) -> Audit:
     """Compares a dataset with its manifest, down to each decoded demo.
 
@@ -102,30 +108,41 @@ def verify(root: str | Path, *, quick: bool = False, progress: Progress | None =
     root = Path(root)
     found = manifest.read(root)
     problems = list(_single_files(root, found)) + list(_extra_files(root, found))
-    files, digests, rows = len(found.files), [], []
-    shard_paths = {entry.path for entry in found.shards}
+    files, claims = len(found.files), _Claims(root, found)
     is_slim = _is_slim(root, found)
-    entries = {entry.path: entry for entry in (found.shards if is_slim else manifest.units(found))}
-    for done, entry in enumerate(entries.values(), 1):
-        with remote.filled(root / entry.path):
-            record, damage = _unit_files(root, entry)
-            files += len(record["files"]) if record else 0
-            problems += damage
-            if entry.path in shard_paths and record and not damage:
-                rows += [(entry.path, number, row) for number, row in enumerate(record["rows"])]
-                digests += [row["sha256"] for row in record["rows"]]
-                problems += [] if quick else list(_decoded(root, entry, record))
-        if progress:
-            progress(done, len(entries))
+    total = len(found.shards) if is_slim else sum(len(stage.units) for stage in found.stages.values())
+    try:
+        for done, (entry, is_shard) in enumerate(_units(found, is_slim), 1):
+            with remote.filled(root / entry.path):
+                record, damage = _unit_files(root, entry)
+                files += len(record["files"]) if record else 0
+                problems += damage
+                if is_shard and record and not damage:
+                    claims.see(entry.path, record)
+                    problems += [] if quick else list(_decoded(root, entry, record))
+            if progress:
+                progress(done, total)
+        notes = list(_notes(root, found))
+    except CorruptionError as error:  # the table of units cannot be read
+        problems, notes = [*problems, str(error)], []
     if found.shards and not problems:
-        problems += list(_claims(root, found, rows, digests))
-    demos = 0 if quick else len(rows)
-    return Audit(str(root), tuple(problems), tuple(_notes(root, found)), files, demos, found.content_sha256)
+        problems += list(claims.problems())
+    return Audit(str(root), tuple(problems), tuple(notes), files, 0 if quick else claims.demos, found.content_sha256)
 
 
 def _is_slim(root: Path, found: Manifest) -> bool:
     """Whether this is a copy of the shards alone: all upstream units were left behind, as when only readers are served."""
     return bool(found.shards) and not (root / "stages").exists()
+
+
+def _units(found: Manifest, is_slim: bool = False) -> Iterator[tuple[UnitEntry, bool]]:
+    """Each unit once, shards first, and whether it is one; of a slim copy the shards alone."""
+    yield from ((entry, True) for entry in found.shards)
+    if is_slim:
+        return
+    shards = {entry.path for entry in found.shards}  # the units of the last stage are the shards
+    for stage in found.stages.values():
+        yield from ((entry, False) for entry in stage.units if entry.path not in shards)
 
 
 def _single_files(root: Path, found: Manifest) -> Iterator[str]:
@@ -146,9 +163,19 @@ def _extra_files(root: Path, found: Manifest) -> Iterator[str]:
     for path in sorted((root / manifest.PREVIEWS).glob("*")):
         if path.relative_to(root).as_posix() not in found.files and not path.match(durable.TEMPORARY):
             yield f"{path.relative_to(root)}: not part of the dataset"
-    for path in sorted([*root.glob("shards/*"), *root.glob("shards/*/*"), *root.glob("stages/*"), *root.glob("stages/*/*")]):
-        if not path.is_dir() or path.is_symlink():
-            yield f"{path.relative_to(root)}: not part of the dataset"
+    for name, is_folder in [*_listed(root, "shards", 2), *_listed(root, "stages", 2)]:
+        if not is_folder:
+            yield f"{name}: not part of the dataset"
+
+
+def _listed(root: Path, name: str, depth: int) -> Iterator[tuple[str, bool]]:
+    """What is in a folder, and in its folders so many levels down: each path, and whether it is a folder and no link."""
+    with suppress(FileNotFoundError), os.scandir(root / name) as entries:
+        for entry in sorted(entries, key=lambda entry: entry.name):
+            is_folder = entry.is_dir(follow_symlinks=False)
+            yield f"{name}/{entry.name}", is_folder
+            if depth > 1 and is_folder:
+                yield from _listed(root, f"{name}/{entry.name}", depth - 1)
 
 
 def _unit_files(root: Path, entry: UnitEntry) -> tuple[dict[str, Any] | None, list[str]]:
@@ -182,52 +209,80 @@ def _decoded(root: Path, entry: UnitEntry, record: Mapping[str, Any]) -> Iterato
         yield from (f"{entry.path}: demo {row['demo']}: {problem}" for problem in store.problems(sample))
 
 
-def _claims(root: Path, found: Manifest, rows: list[tuple[str, int, dict[str, Any]]], digests: list[str]) -> Iterator[str]:
-    """Compares what manifest and index say with the shards: content, places, splits that share nothing."""
-    if store.content_digest(digests) != found.content_sha256:
-        yield "manifest.json: content_sha256 is not that of the shards"
-    if durable.digest(found.recipe) != found.recipe_sha256:
-        yield "manifest.json: recipe_sha256 is not that of the recipe"
-    try:
-        index = manifest.read_index(root)
-        yield from _index_problems(index, rows)
-        yield from _leaks(index, found)
-    except CorruptionError as error:
-        yield str(error)
-    except KeyError as error:
-        yield f"index.parquet: column {error} is missing"
+class _Claims:
+    """What manifest and index say of the shards, compared with each shard as it comes by: content, places, splits."""
+
+    PLACE = ("shard", "row", "demo", *INSTANCES, "sha256")
+
+    def __init__(self, root: Path, found: Manifest) -> None:
+        self.root, self.found, self.demos = root, found, 0
+        self._content, self._agrees, self._error = store.ContentDigest(), True, ""
+        self._stored = self._stream()
+
+    def see(self, path: str, record: Mapping[str, Any]) -> None:
+        """Compares a shard's own record with the rows of the index that come next."""
+        rows = record["rows"]
+        self.demos += len(rows)
+        self._content.add(row["sha256"] for row in rows)
+        told = [
+            (path, number, row["demo"], *(row[name] for name in INSTANCES), row["sha256"]) for number, row in enumerate(rows)
+        ]
+        self._agrees = self._agrees and list(islice(self._stored, len(told))) == told
+
+    def _stream(self) -> Iterator[tuple[Any, ...]]:
+        try:
+            yield from manifest.read_index(self.root).stream(self.PLACE)
+        except CorruptionError as error:
+            self._error = str(error)
+        except KeyError as error:
+            self._error = f"index.parquet: column {error} is missing"
+
+    def problems(self) -> Iterator[str]:
+        """What is claimed and isn't so, once all shards have come by."""
+        if self._content.hexdigest() != self.found.content_sha256:
+            yield "manifest.json: content_sha256 is not that of the shards"
+        if durable.digest(self.found.recipe) != self.found.recipe_sha256:
+            yield "manifest.json: recipe_sha256 is not that of the recipe"
+        if manifest.listed_shards(self.root) != [
+            {name: getattr(entry, name) for name in ("path", "demos", "sha256")} for entry in self.found.shards
+        ]:
+            yield "manifest.json: shards: not the units of the last stage"
+        if next(self._stored, None) is not None or not self._agrees:
+            yield self._error or "index.parquet: its rows are not the demos of the shards"
+        if self._error:
+            return
+        index = manifest.read_index(self.root)
+        if (np.diff(index.read("demo")) <= 0).any():
+            yield "index.parquet: a demo is there twice, or out of order"
+        yield from _leaks(index, self.found)
 
 
-def _index_problems(index: Mapping[str, Array], rows: list[tuple[str, int, dict[str, Any]]]) -> Iterator[str]:
-    expected = [(shard, number, row["demo"], *(row[name] for name in INSTANCES), row["sha256"]) for shard, number, row in rows]
-    stored = zip(index["shard"], index["row"], index["demo"], *(index[name] for name in INSTANCES), index["sha256"])
-    if [tuple(str(value) for value in row) for row in stored] != [tuple(str(value) for value in row) for row in expected]:
-        yield "index.parquet: its rows are not the demos of the shards"
-    if len(set(index["demo"].tolist())) != len(index["demo"]):
-        yield "index.parquet: a demo is there twice"
-
-
-def _leaks(index: Mapping[str, Array], found: Manifest) -> Iterator[str]:
+def _leaks(index: Index, found: Manifest) -> Iterator[str]:
     """Instances that two splits share, and splits that the manifest tells otherwise."""
+    splits = index.read("split")
     for name in INSTANCES:
-        owners: dict[int, set[str]] = {}
-        for split in SPLITS:
-            mine = sorted(set(index[name][index["split"] == split].tolist()))
-            if split in found.splits and mine != getattr(found.splits[split], f"{name}s"):
+        instances = index.read(name)
+        mine = {split: distinct(instances[splits == split]) for split in SPLITS}
+        for split in found.splits.keys() & mine.keys():
+            told = getattr(found.splits[split], f"{name}s")
+            if told != (len(mine[split]) if isinstance(told, int) else mine[split].tolist()):
                 yield f"manifest.json: splits.{split}.{name}s: not those of the index"
-            for instance in mine:
-                owners.setdefault(instance, set()).add(split)
-        shared = {instance: splits for instance, splits in owners.items() if len(splits) > 1}
-        for instance, splits in sorted(shared.items())[:3]:
-            yield f"index.parquet: {name} {instance} is in {' and '.join(sorted(splits))}: {len(shared)} instances leak"
+        for a, b in combinations(sorted(mine), 2):
+            shared = np.intersect1d(mine[a], mine[b], assume_unique=True)
+            if len(shared):
+                yield f"index.parquet: {name} {shared[0]} is in {a} and {b}: {len(shared)} instances leak"
 
 
 def _notes(root: Path, found: Manifest) -> Iterator[str]:
     if _is_slim(root, found):
         yield "stages/ is not here: the shards are complete in themselves, but cannot be labelled again"
-    count, size = len(_unnamed(root, found)), sum(_size(path) for path in _unnamed(root, found))
-    if count:
-        yield f"{count} units ({size / 1e6:.1f} MB) are of other recipes or labellings; `dapdata gc` frees them"
+    for entry in found.missing:
+        first, last = entry.demo_range[0], entry.demo_range[1] - 1
+        yield f"demos {first} to {last} are missing: {entry.stage} failed: {entry.reason}; run generate and label to try again"
+    unnamed = _unnamed(root, found)
+    if unnamed:
+        size = sum(_size(path) for path in unnamed)
+        yield f"{len(unnamed)} units ({size / 1e6:.1f} MB) are of other recipes or labellings; `dapdata gc` frees them"
 
 
 # How far, what is inside, what may go ----------------------------------------------------------------------
@@ -252,36 +307,26 @@ def status(root: str | Path) -> Facts:
         }
     elif not (root / manifest.PROGRESS).is_file():
         manifest.read(root)  # raises with the reason why this is no dataset
-    log = _log(root)
+    cpu_seconds, peak_mb = _spent(root)
     facts = {
         "root": str(root),
         "published": published,
         "working": remote.holder(root),
         "in_progress": _in_progress(root),
         "quarantined": sorted(path.name for path in root.glob("quarantine/*.json")),
-        "cpu_seconds": _cpu_seconds(log),
-        "peak_mb": max((line["peak_mb"] for line in log), default=None),
+        "cpu_seconds": cpu_seconds,
+        "peak_mb": peak_mb,
     }
     return Facts(facts)
 
 
-def _log(root: Path) -> list[dict[str, Any]]:
-    """The lines of the log that can be read; the last may be half-written."""
-    lines = []
-    path = root / manifest.LOG
-    for text in path.read_text().splitlines() if path.is_file() else ():
-        try:
-            lines.append(dict(json.loads(text)))
-        except ValueError:
-            continue
-    return lines
-
-
-def _cpu_seconds(log: list[dict[str, Any]]) -> dict[str, float]:
-    total: dict[str, float] = {}
-    for line in log:
-        total[line["stage"]] = round(total.get(line["stage"], 0.0) + line["cpu_seconds"], 3)
-    return total
+def _spent(root: Path) -> tuple[dict[str, float], int | None]:
+    """CPU seconds of each stage, and the largest memory of a worker, as the log has them."""
+    seconds, peak = Counter[str](), None
+    for line in manifest.read_log(root):
+        seconds[line["stage"]] += line["cpu_seconds"]
+        peak = max(peak or 0, line["peak_mb"])
+    return {stage: round(total, 3) for stage, total in seconds.items()}, peak
 
 
 def _in_progress(root: Path) -> dict[str, Any] | None:
@@ -290,13 +335,13 @@ def _in_progress(root: Path) -> dict[str, Any] | None:
         left = json.loads((root / manifest.PROGRESS).read_bytes())
         demos, seed, shard_size = (left["recipe"][name] for name in ("demos", "seed", "shard_size"))
         layout, todo = Layout(root, left["specs"], seed, shard_size, left["shard_stage"]), units(demos, shard_size)
-        done = {name: sum(store.is_committed(layout.folder(name, unit)) for unit in todo) for name in left["stages"]}
+        done = {name: len(store.committed(root, [layout.path(name, unit) for unit in todo])) for name in left["stages"]}
     except (OSError, ValueError, KeyError, TypeError):  # nothing is in progress, or what it left is no help
         return None
     return {"demos": demos, "units": len(todo), "done": done}
 
 
-@remote.on_copy(files=(manifest.MANIFEST, manifest.INDEX))
+@remote.on_copy(files=remote.TABLES)
 def inspect(root: str | Path) -> Facts:
     """What is inside: counts, statistics a demo, rejects by reason, sizes."""
     root = Path(root)
@@ -307,29 +352,31 @@ def inspect(root: str | Path) -> Facts:
         "task": found.task,
         "content_sha256": found.content_sha256,
         "demos": found.demos,
-        "demos_in_shards": sum(shard.demos for shard in found.shards),
+        "demos_in_shards": sum(entry.demos for entry in found.splits.values()),
         "shards": len(found.shards),
         "splits": {name: entry.demos for name, entry in found.splits.items()},
         "rejects": found.rejects.model_dump(),
-        "bytes": {"shards": sum(s.bytes for s in found.shards)}
-        | {name: sum(unit.bytes for unit in stage.units) for name, stage in found.stages.items()},
+        "missing": [f"{entry.demo_range[0]} to {entry.demo_range[1] - 1}: {entry.reason}" for entry in found.missing],
+        "bytes": {"shards": manifest.total_bytes(found.shards)}
+        | {name: manifest.total_bytes(stage.units) for name, stage in found.stages.items()},
         "created_by": found.created_by,
     }
-    return Facts(about | ({"per_demo": _statistics(manifest.read_index(root))} if found.shards else {}))
+    return Facts(about | ({"per_demo": _statistics(root)} if found.shards else {}))
 
 
-def _statistics(index: Mapping[str, Array]) -> dict[str, dict[str, float]]:
+def _statistics(root: Path) -> dict[str, dict[str, float]]:
     """Mean, least and most of each count."""
+    index = manifest.read_index(root)
     places = ("demo", "row", "seed", *INSTANCES)
-    counts = {name: column for name, column in index.items() if column.dtype.kind == "i" and name not in places}
+    counts = ((name, index.read(name)) for name in index.numbers if name not in places)
     return {
         name: {"mean": float(column.mean()), "min": int(column.min()), "max": int(column.max())}
-        for name, column in counts.items()
+        for name, column in counts
         if len(column)
     }
 
 
-@remote.on_copy(units=True)
+@remote.on_copy(units=True, leftovers=True)
 def gc(root: str | Path, *, dry_run: bool = False) -> Facts:
     """Removes units that the manifest does not name: other recipes, other labellings, what killed processes left.
 
@@ -353,10 +400,9 @@ def gc(root: str | Path, *, dry_run: bool = False) -> Facts:
 
 def _unnamed(root: Path, found: Manifest) -> list[Path]:
     """Folders of units that the manifest does not name."""
-    named = {root / entry.path for entry in manifest.units(found)}
-    return [
-        path for path in sorted([*root.glob("shards/*/*"), *root.glob("stages/*/*")]) if path.is_dir() and path not in named
-    ]
+    named = {entry.path for entry, _ in _units(found)}
+    listed = [*_listed(root, "shards", 2), *_listed(root, "stages", 2)]
+    return [root / name for name, is_folder in listed if is_folder and name.count("/") == 2 and name not in named]
 
 
 def _size(folder: Path) -> int:

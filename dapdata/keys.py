@@ -20,7 +20,10 @@ UNIT_SLIPS = {"m": (1000.0, 100.0), "rad": (180 / pi,)}  # written in mm, cm or 
 
 
 def at(root: Schema, path: Location) -> Schema:
-    """The schema of the key at a path, with its $ref followed; {} where there is no such key."""
+    """The schema of the key at a path, with its $ref followed; {} where there is no such key.
+
+    In a list of scenes, the path names the task after the index, as pydantic's locations do.
+    """
     here = root
     for part in path:
         if isinstance(part, int):
@@ -28,7 +31,8 @@ def at(root: Schema, path: Location) -> Schema:
             items = here.get("prefixItems", [])
             inner = unit | (items[part] if part < len(items) else here.get("items", {}))
         else:
-            inner = here.get("properties", {}).get(part, {})
+            task = here.get("discriminator", {}).get("mapping", {}).get(part)
+            inner = {"$ref": task} if task else here.get("properties", {}).get(part, {})
         here = deref(inner, root)
     return here
 
@@ -70,6 +74,8 @@ def allowed(schema: Schema, root: Schema) -> str:
     if "anyOf" in schema:
         unit = {"unit": schema["unit"]} if "unit" in schema else {}
         return " or ".join(allowed(unit | option, root) for option in schema["anyOf"])
+    if "discriminator" in schema:
+        return f"a section with `task:` one of {', '.join(schema['discriminator']['mapping'])}"
     if is_section(schema):
         return f"a section with {', '.join(schema['properties'])}"
     if schema.get("type") == "array":

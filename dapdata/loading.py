@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +23,7 @@ from dapdata.records import Array
 from dapdata.remote import Place
 from dapdata.split import SPLITS
 from dapdata.store import COLUMNS, Block, Sample
+from dapdata.tables import Index
 
 if TYPE_CHECKING:
     from torch.utils import data
@@ -42,18 +44,19 @@ def open(root: str | Path, split: str | None = None) -> Dataset:
         CorruptionError: if the manifest and the index don't agree.
     """
     place = remote.locate(root)
-    with remote.working_copy(place, files=(manifest.MANIFEST, manifest.INDEX)) as folder:
-        found = manifest.read(folder)
-        index = manifest.read_index(folder) if found.shards else {}
+    kept = remote.Kept(place)
+    with kept.named():
+        found = manifest.read(kept.root)
     if not found.shards:
         raise FormatError(f"{place}: generated but not labelled, expected shards; run `dapdata label {place}`")
     known = list(found.splits)
     if split is not None and split not in known:
         raise UsageError(f"split: got '{split}', expected one of {', '.join(SPLITS)}{hint(split, list(SPLITS))}")
-    if len(index["demo"]) != sum(shard.demos for shard in found.shards):
+    index = manifest.read_index(kept.root)
+    if index.rows != sum(entry.demos for entry in found.splits.values()):
         raise CorruptionError(f"{place}: index.parquet and manifest.json name different demos; run `dapdata verify {place}`")
-    chosen = np.arange(len(index["demo"])) if split is None else np.flatnonzero(index["split"] == split)
-    return Dataset(place, split, found, {name: column[chosen] for name, column in index.items()})
+    mine = index if split is None else index.only(np.flatnonzero(index.read("split") == split))
+    return Dataset(place, split, found, mine, kept)
 
 
 @dataclass
@@ -63,7 +66,8 @@ class Dataset:
     root: Place  # folder or URL
     split: str | None
     manifest: Manifest = field(repr=False)
-    index: Mapping[str, Array] = field(repr=False)  # columns of index.parquet, for these demos
+    index: Index = field(repr=False)  # columns of index.parquet, for these demos
+    _kept: remote.Kept | None = field(default=None, repr=False)  # where the tables lie that columns are read from
     _held: dict[str, Block] = field(default_factory=dict, repr=False)
 
     @property
@@ -82,7 +86,7 @@ class Dataset:
         return self.manifest.content_sha256
 
     def __len__(self) -> int:
-        return len(self.index["demo"])
+        return self.index.rows
 
     def __getitem__(self, number: int) -> Sample:
         """All arrays of one demo by path; the shard that it is in stays in memory until another is asked for."""
@@ -192,10 +196,9 @@ class Order:
 
     def numbers(self, epoch: int) -> Array:
         """(D,) indices into the dataset in the order of a pass over it, all ranks together."""
-        shards = self.dataset.index["shard"]
-        blocks = [np.flatnonzero(shards == shard) for shard in dict.fromkeys(shards.tolist())]
         if not self.shuffle:
-            return np.arange(len(shards))
+            return np.arange(len(self.dataset))
+        blocks = self._blocks
         random = rng.stream(self.seed, "stream", epoch)
         order = random.permutation(len(blocks))
         mixed = [
@@ -203,6 +206,13 @@ class Order:
             for start in range(0, len(order), BLOCKS_HELD)
         ]
         return np.concatenate([np.zeros(0, dtype=np.int64), *mixed])
+
+    @cached_property
+    def _blocks(self) -> list[Array]:
+        """Indices into the dataset, shard by shard."""
+        codes, _ = self.dataset.index.codes("shard")
+        order = np.argsort(codes, kind="stable")
+        return np.split(order, np.flatnonzero(np.diff(codes[order])) + 1) if len(order) else []
 
     def part(self, epoch: int, worker: int, workers: int) -> Array:
         """(D',) indices of one worker of this rank in a pass: a contiguous piece, so that it reads few shards."""
@@ -216,7 +226,8 @@ class Order:
 
     def __len__(self) -> int:
         """Demos of this rank in a pass."""
-        return len(self.part(0, 0, 1))
+        demos = len(self.dataset)
+        return demos // self.world_size if self.even else (demos - self.rank - 1) // self.world_size + 1
 
 
 def read_in_order(dataset: Dataset, numbers: Array, paths: Sequence[str] | None) -> Iterator[Sample]:

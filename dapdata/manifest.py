@@ -4,28 +4,35 @@ The manifest names everything else with its sha256: each unit by the hash of its
 unit's files, and each single file by its own. It is replaced last. Where a file with a fixed name (index, card)
 changes, the old manifest goes first: a crash in between leaves no manifest rather than one that is wrong, and
 running the command again brings it back at once.
+
+A manifest is of format 1 and has all in itself as long as it is small. With more than `LARGE` units and instances it is
+of format 2: shards are still listed with path, demos and sha256, but all else of units stands in `units.parquet`, which
+it names by its sha256, and of the instances of a split only their number is told (the index has them). So a reader
+of format 1 reads every dataset that it could hold anyway, and one of ten million demos opens in a second.
 """
 
 from __future__ import annotations
 
-import io
 import json
+from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
+from functools import cached_property
 from hashlib import sha256
-from pathlib import Path, PurePosixPath
-from typing import Annotated, Any
+from pathlib import Path
+from typing import Annotated, Any, Literal, overload
 
-import numpy as np
 from pydantic import AfterValidator, Field, ValidationError
 
-from dapdata import durable
+from dapdata import durable, tables
 from dapdata.config import Section
 from dapdata.errors import CorruptionError, FormatError
-from dapdata.records import Array
 
-FORMAT = 1
+FORMAT: Literal[1] = 1
+LARGE_FORMAT: Literal[2] = 2
+LARGE = 100_000  # units and instances: as many take a quarter of a second to open, and 100 MB of memory
 MANIFEST = "manifest.json"
 INDEX = "index.parquet"
+UNITS = "units.parquet"  # of datasets of format 2
 CARD = "README.md"
 CROISSANT = "croissant.json"
 PREVIEWS = "preview"
@@ -35,8 +42,7 @@ LOG = "log.jsonl"  # when each unit was made, by whom, how long it took: never r
 
 def _inside(path: str) -> str:
     """A path that stays in the dataset's folder."""
-    parts = PurePosixPath(path).parts
-    if not parts or path.startswith("/") or "\\" in path or "\0" in path or any(part in ("..", ".") for part in parts):
+    if "\\" in path or "\0" in path or any(part in ("", ".", "..") for part in path.split("/")):
         raise ValueError("expected a relative path inside of the dataset")
     return path
 
@@ -45,14 +51,19 @@ RelativePath = Annotated[str, AfterValidator(_inside)]
 Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 
 
-class UnitEntry(Section):
-    """A committed unit: a shard, or a cached unit of an upstream stage."""
+class ShardEntry(Section):
+    """A committed unit, as much of it as everybody needs."""
 
     path: RelativePath = Field(description="folder of the Zarr group, from the dataset's folder")
     demos: int = Field(ge=0, description="demos that are in it")
+    sha256: Sha256 = Field(description="of the group's own zarr.json, which names every other file with its sha256")
+
+
+class UnitEntry(ShardEntry):
+    """A committed unit: a shard, or a cached unit of an upstream stage."""
+
     demo_range: tuple[int, int] = Field(description="first demo, and one past the last, that it was made for")
     key: Sha256 = Field(description="digest of all that decides its content")
-    sha256: Sha256 = Field(description="of the group's own zarr.json, which names every other file with its sha256")
     bytes: int = Field(ge=0, description="size of its files")
 
 
@@ -60,15 +71,23 @@ class StageEntry(Section):
     """How a stage was run, and the units that came of it."""
 
     spec: dict[str, Any] = Field(description="version, recipe sections and packages that decide its results")
-    units: list[UnitEntry] = Field(description="in demo order; empty if it is to be run again")
+    units: Sequence[UnitEntry] = Field(description="in demo order; empty if it is to be run again")
+
+
+class MissingEntry(Section):
+    """Demos that are not there because their unit failed, in a dataset that was published all the same."""
+
+    demo_range: tuple[int, int] = Field(description="first demo, and one past the last")
+    stage: str = Field(description="that failed; those after it were not run")
+    reason: str = Field(description="how its last try ended")
 
 
 class SplitEntry(Section):
     """A split and the instances in it; no instance is in two splits."""
 
     demos: int = Field(ge=0)
-    container_instances: list[int]
-    object_instances: list[int]
+    container_instances: list[int] | int = Field(description="or in format 2 their number")
+    object_instances: list[int] | int = Field(description="or in format 2 their number")
 
 
 class Rejects(Section):
@@ -79,29 +98,103 @@ class Rejects(Section):
     goals: dict[str, int] = Field(description="candidate goals that did not hold; kept apart in rejected_goals/")
 
 
-class Manifest(Section):
-    """A dataset: what it was made from, and what it consists of."""
-
-    format: int = Field(ge=1, description="version of the format")
+class _Facts(Section):
     name: str
     task: str
-    demos: int = Field(ge=0, description="demos asked for; those in the shards are this less rejects.demos")
+    demos: int = Field(ge=0, description="demos asked for; those in the shards are this less rejects.demos and missing")
     content_sha256: Sha256 = Field(description="over the decoded arrays of every demo, in demo order")
     recipe: dict[str, Any] = Field(description="resolved: every default filled in")
     recipe_sha256: Sha256 = Field(description="of the resolved recipe as canonical JSON")
-    shards: list[UnitEntry] = Field(description="in demo order; empty until the dataset is labelled")
     splits: dict[str, SplitEntry] = Field(description="train, val, test; unused: would share an instance with two of them")
     rejects: Rejects
-    stages: dict[str, StageEntry] = Field(description="every stage that was run; the units of the last are the shards")
+    missing: list[MissingEntry] = Field(
+        default=[], description="units that failed; empty unless published with --allow-missing"
+    )
     files: dict[RelativePath, Sha256] = Field(description="every other file that belongs to the dataset")
     created_by: dict[str, str] = Field(description="versions of the packages that wrote it")
 
 
-def units(found: Manifest) -> Iterator[UnitEntry]:
-    """Every unit that a manifest names; the shards come twice, as units of their stage too."""
-    yield from found.shards
-    for stage in found.stages.values():
-        yield from stage.units
+class Manifest(_Facts):
+    """A dataset: what it was made from, and what it consists of. In memory every manifest is one, of either format."""
+
+    format: Literal[1] = Field(description="version of the format")
+    shards: Sequence[UnitEntry] = Field(description="in demo order; empty until the dataset is labelled")
+    stages: dict[str, StageEntry] = Field(description="every stage that was run; the units of the last are the shards")
+
+
+class LargeStageEntry(Section):
+    """How a stage was run, and how many units came of it."""
+
+    spec: dict[str, Any] = Field(description="version, recipe sections and packages that decide its results")
+    units: int = Field(ge=0, description="rows of units.parquet with this stage; 0 if it is to be run again")
+
+
+class LargeManifest(_Facts):
+    """A dataset whose units stand in units.parquet: stage, path, demos, start, stop, key, sha256, bytes."""
+
+    format: Literal[2] = Field(description="version of the format")
+    shards: Sequence[ShardEntry] = Field(description="in demo order; empty until the dataset is labelled")
+    shard_stage: str = Field(description="the stage whose units are the shards")
+    stages: dict[str, LargeStageEntry] = Field(description="every stage that was run")
+
+
+class Units(Sequence[UnitEntry]):
+    """The units of one stage in demo order, from `units.parquet`, which is read when the first of them is asked for."""
+
+    def __init__(self, table: Path, stage: str, count: int) -> None:
+        self.table, self.stage, self._rows = table, stage, count
+
+    def __len__(self) -> int:
+        return self._rows
+
+    @overload
+    def __getitem__(self, number: int) -> UnitEntry: ...
+    @overload
+    def __getitem__(self, number: slice) -> list[UnitEntry]: ...
+    def __getitem__(self, number: int | slice) -> UnitEntry | list[UnitEntry]:
+        if isinstance(number, slice):
+            return [self[i] for i in range(*number.indices(self._rows))]
+        path, demos, start, stop, key, digest, size = (column[number] for column in self._columns)
+        return UnitEntry.model_construct(  # the columns were checked when they were read
+            path=path, demos=demos, demo_range=(start, stop), key=key.hex(), sha256=digest.hex(), bytes=size
+        )
+
+    def __iter__(self) -> Iterator[UnitEntry]:
+        return (self[i] for i in range(self._rows))
+
+    def total(self, column: str) -> int:
+        """The sum of a column, of which nothing is kept."""
+        return sum(tables.read(self.table, "stage", self.stage, [column])[column])
+
+    @cached_property
+    def _columns(self) -> list[list[Any]]:
+        """path, demos, start, stop, key, sha256, bytes."""
+        found = tables.read(self.table, "stage", self.stage)
+        try:
+            columns = [found[name] for name in UNIT_COLUMNS]
+            for path in columns[0]:
+                _inside(path)
+        except (KeyError, ValueError, TypeError) as error:
+            raise CorruptionError(f"{self.table}: {error}; expected the units of stage {self.stage}") from error
+        if len(columns[0]) != self._rows:
+            raise CorruptionError(f"{self.table}: {len(columns[0])} units of stage {self.stage}, expected {self._rows}")
+        return columns
+
+
+UNIT_COLUMNS = ("path", "demos", "start", "stop", "key", "sha256", "bytes")
+
+
+def total_bytes(units: Sequence[UnitEntry]) -> int:
+    """Bytes of all files of some units."""
+    return units.total("bytes") if isinstance(units, Units) else sum(unit.bytes for unit in units)
+
+
+def unit_row(stage: str, entry: UnitEntry) -> dict[str, Any]:
+    """A unit as a row of `units.parquet`."""
+    digests = {"key": bytes.fromhex(entry.key), "sha256": bytes.fromhex(entry.sha256)}
+    start, stop = entry.demo_range
+    values = {"path": entry.path, "demos": entry.demos, "start": start, "stop": stop, **digests, "bytes": entry.bytes}
+    return {"stage": stage, **values}
 
 
 def read(root: Path) -> Manifest:
@@ -120,22 +213,49 @@ def read(root: Path) -> Manifest:
         raise FormatError(f"{root}: no {MANIFEST}, expected a dataset's folder; datasets are made with `dapdata generate`")
     try:
         tree = json.loads(path.read_bytes())
-        _check_format(path, tree)
-        return Manifest.model_validate_json(json.dumps(tree))
+        if _format(path, tree) == FORMAT:
+            return Manifest.model_validate_json(json.dumps(tree))
+        return _from_large(root, tree)
     except (ValueError, RecursionError) as error:  # pydantic's and json's errors are ValueErrors
         if isinstance(error, FormatError):
             raise
         raise CorruptionError(f"{path}: {_first_problem(error)}; expected the manifest of format {FORMAT}") from error
 
 
-def _check_format(path: Path, tree: Any) -> None:
+def _format(path: Path, tree: Any) -> int:
+    """The manifest's format, or a FormatError if it is none of ours."""
     found = tree.get("format") if isinstance(tree, dict) else None
+    known = f"{FORMAT} or {LARGE_FORMAT}"
     if type(found) is not int:
-        raise FormatError(f"{path}: `format` is {found!r}, expected {FORMAT}; this is no manifest of dapdata")
-    if found != FORMAT:
+        raise FormatError(f"{path}: `format` is {found!r}, expected {known}; this is no manifest of dapdata")
+    if found not in (FORMAT, LARGE_FORMAT):
         maker = tree.get("created_by", {}).get("dapdata", "unknown") if isinstance(tree.get("created_by"), dict) else "unknown"
         remedy = "update dapdata" if found > FORMAT else "generate it again, or read it with that version"
-        raise FormatError(f"{path}: format {found}, made by dapdata {maker}; this dapdata reads format {FORMAT}: {remedy}")
+        raise FormatError(f"{path}: format {found}, made by dapdata {maker}; this dapdata reads formats {known}: {remedy}")
+    return found
+
+
+def _from_large(root: Path, tree: dict[str, Any]) -> Manifest:
+    """A manifest of format 2; its shards are counted, and looked at only where they are used, in the table."""
+    shards = tree.get("shards")
+    if not isinstance(shards, list):
+        raise ValueError("shards: expected a list")
+    large = LargeManifest.model_validate_json(json.dumps({**tree, "shards": []}))
+    facts = {name: getattr(large, name) for name in _Facts.model_fields}
+    units = {name: Units(root / UNITS, name, entry.units) for name, entry in large.stages.items()}
+    stages = {
+        name: StageEntry.model_construct(spec=entry.spec, units=units[name] if entry.units else [])
+        for name, entry in large.stages.items()
+    }
+    return Manifest.model_construct(
+        **facts, format=FORMAT, shards=Units(root / UNITS, large.shard_stage, len(shards)) if shards else [], stages=stages
+    )
+
+
+def listed_shards(root: Path) -> list[Any]:
+    """The shards as the manifest itself lists them, for whoever reads nothing else: path, demos and sha256 of each."""
+    listed = json.loads((root / MANIFEST).read_bytes())["shards"]
+    return [{name: shard.get(name) for name in ShardEntry.model_fields} for shard in listed]
 
 
 def _first_problem(error: Exception) -> str:
@@ -145,65 +265,74 @@ def _first_problem(error: Exception) -> str:
     return str(error)
 
 
-def publish(root: Path, manifest: Manifest, files: Mapping[str, bytes]) -> None:
+def publish(root: Path, manifest: Manifest, files: Mapping[str, bytes | Path]) -> None:
     """Makes the manifest the dataset's own, together with the single files whose hashes are added to it.
 
     Args:
         root: The dataset's folder; the caller holds its lock.
         manifest: What is there now; every unit that it names is committed.
-        files: Contents by path, such as the index and the card.
+        files: Contents by path, such as the index and the card; or files that are moved there (or are there). With
+            `UNITS` among them, the manifest is of format 2 and its units are those.
     """
-    hashes = {path: sha256(data).hexdigest() for path, data in files.items()}
-    manifest = manifest.model_copy(update={"files": dict(sorted(hashes.items()))})
-    data = json.dumps(manifest.model_dump(mode="json"), indent=1, sort_keys=True).encode() + b"\n"
-    changed = {path: files[path] for path in files if not _holds(root / path, files[path])}
+    hashes = {path: durable.hash_file(new) if isinstance(new, Path) else sha256(new).hexdigest() for path, new in files.items()}
+    data = _text(manifest.model_copy(update={"files": dict(sorted(hashes.items()))}), files.get(UNITS))
+    changed = [path for path in files if not (root / path).is_file() or durable.hash_file(root / path) != hashes[path]]
     gone = [path for path in single_files(root) if path not in files]
-    if _holds(root / MANIFEST, data) and not changed and not gone:
+    target = root / MANIFEST
+    if target.is_file() and target.read_bytes() == data and not changed and not gone:
         return
     if changed or gone:
-        durable.remove_file(root / MANIFEST)
-    for path, content in changed.items():
-        durable.replace_file(root / path, content)
+        durable.remove_file(target)
+    for path in changed:
+        new = files[path]
+        if isinstance(new, Path):
+            durable.move_file(new, root / path)
+        else:
+            durable.replace_file(root / path, new)
     for path in gone:
         durable.remove_file(root / path)
-    durable.replace_file(root / MANIFEST, data)
+    durable.replace_file(target, data)
 
 
-def _holds(path: Path, data: bytes) -> bool:
-    return path.is_file() and path.read_bytes() == data
+def _text(manifest: Manifest, table: bytes | Path | None) -> bytes:
+    """A manifest as it is stored."""
+    if not isinstance(table, Path):
+        return json.dumps(manifest.model_dump(mode="json"), indent=1, sort_keys=True).encode() + b"\n"
+    tree = manifest.model_copy(update={"shards": [], "stages": {}}).model_dump(mode="json")
+    shards = manifest.shards
+    listed = Units(table, shards.stage, len(shards)) if isinstance(shards, Units) else []
+    tree |= {
+        "format": LARGE_FORMAT,
+        "shards": [{name: getattr(entry, name) for name in ShardEntry.model_fields} for entry in listed],
+        "shard_stage": shards.stage if isinstance(shards, Units) else "",
+        "stages": {name: {"spec": entry.spec, "units": len(entry.units)} for name, entry in manifest.stages.items()},
+    }
+    return json.dumps(tree, sort_keys=True).encode() + b"\n"
 
 
 def single_files(root: Path) -> list[str]:
     """The single files that belong to datasets and are there, whether or not a manifest survived that names them."""
-    found = [root / INDEX, root / CARD, root / CROISSANT, *(root / PREVIEWS).glob("*")]
+    found = [root / INDEX, root / UNITS, root / CARD, root / CROISSANT, *(root / PREVIEWS).glob("*")]
     return [path.relative_to(root).as_posix() for path in found if path.is_file()]
 
 
-# The index -------------------------------------------------------------------------------------------------
-
-
-def index_bytes(rows: Sequence[Mapping[str, Any]]) -> bytes:
-    """A Parquet file with one row a demo; integers are int64, words are strings."""
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    sink = io.BytesIO()
-    table = pa.Table.from_pylist([dict(row) for row in rows])
-    pq.write_table(table, sink, compression="zstd")
-    return sink.getvalue()
-
-
-def read_index(root: Path) -> dict[str, Array]:
-    """The columns of `index.parquet` as arrays of one length.
+def read_index(root: Path) -> tables.Index:
+    """The columns of `index.parquet` as arrays of one length, each read when it is first asked for.
 
     Raises:
         CorruptionError: if it is missing or no Parquet file.
     """
-    import pyarrow as pa
-    import pyarrow.parquet as pq
+    return tables.Index(root / INDEX)
 
-    try:
-        table = pq.read_table(root / INDEX)
-    except (OSError, pa.ArrowException) as error:
-        raise CorruptionError(f"{root / INDEX}: cannot be read ({error}); run `dapdata verify {root}`") from error
-    return {name: np.asarray(table.column(name).to_pylist()) for name in table.column_names}
+
+def read_log(root: Path, last: int | None = None) -> Iterator[dict[str, Any]]:
+    """The lines of the log that can be read, one for each unit that was made; only the last so many if asked for."""
+    path = root / LOG
+    if not path.is_file():
+        return
+    with path.open(encoding="utf-8", errors="replace") as file:
+        for text in file if last is None else deque(file, last):
+            try:
+                yield dict(json.loads(text))
+            except (ValueError, TypeError):  # half-written, when its writer was killed
+                continue

@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from hashlib import sha256
+from itertools import pairwise
 from math import sqrt
 from multiprocessing import get_context
 from pathlib import Path
@@ -74,6 +75,7 @@ PRECISE_MOVE, PRECISE_TURN = 0.005, np.deg2rad(3.0)  # from the prediction to wh
 FREE = 0.001  # m: less overlap than this is free of collision
 COUNTS = (1, 2, 4, 8, 16, 32)  # K at which modes are counted
 SWEEP = (2, 5, 10, 20, 35)  # mm
+CLEARANCES = (0, 5, 10, 15, 30, np.inf)  # mm: success is counted for goals between two of them, the lower included
 NO_PREDICTION = "no_prediction"
 SOUND = 0.98  # an oracle below this means a broken judge or broken demonstrations
 
@@ -142,6 +144,7 @@ class SceneResult:
     seconds: float  # of physics, all K
     rank: Array  # (C,) rising, with gaps where a candidate has no pose
     legacy: Array  # (2, C, M) bool, from `legacy_rpdiff`
+    clearance: Array  # (M,) m
 
 
 def judge_scene(
@@ -178,6 +181,7 @@ def judge_scene(
         seconds,
         rank,
         legacy_rpdiff(T_world_object, demo.goals),
+        demo.goal_clearance,
     )
 
 
@@ -263,19 +267,31 @@ def _success(results: Sequence[SceneResult], k: int) -> Success:
         success_precise=rate(top_ok & np.array(precise, bool)),
         success_near_goal=rate(top_ok & np.array(near, bool)),
         success_top1_tight=rate((top_ok & np.array(at_tight, bool))[has_tight]),
-        success_tight=rate(np.array([_tight_asked(r) for r in results], bool)[has_tight]),
+        success_tight=rate(np.array([_asked(r, r.tight) for r in results], bool)[has_tight]),
+        success_by_clearance_mm=_by_clearance(results),
         failures=_sorted(Counter(v.reason if v else NO_PREDICTION for v in top if v is None or not v.success)),
         failures_all=_sorted(Counter(v.reason for r in results for v in r.verdicts if not v.success) + missing),
     )
 
 
-def _tight_asked(result: SceneResult) -> bool:
-    """Whether the best-ranked of the candidates that head for a tight goal succeeds there; False where none does."""
-    heads_for_tight = result.tight[result.distance[: len(result.verdicts)].argmin(axis=1)] if result.verdicts else np.zeros(0)
-    if not heads_for_tight.any():
+def _asked(result: SceneResult, wanted: Array) -> bool:
+    """Whether the best-ranked of the candidates that head for one of some (M,) goals succeeds there; False where none does."""
+    heads_there = wanted[result.distance[: len(result.verdicts)].argmin(axis=1)] if result.verdicts else np.zeros(0)
+    if not heads_there.any():
         return False
-    i = int(np.argmax(heads_for_tight))
-    return result.verdicts[i].success and bool((result.distance[i][result.tight] <= NEAR_GOAL).any())
+    i = int(np.argmax(heads_there))
+    return result.verdicts[i].success and bool((result.distance[i][wanted] <= NEAR_GOAL).any())
+
+
+def _by_clearance(results: Sequence[SceneResult]) -> dict[str, Interval]:
+    """`_asked` for the goals of each range of clearance, over the scenes that have one; ranges without a scene are left out."""
+    found = {}
+    for low, high in pairwise(CLEARANCES):
+        wanted = [(low <= 1000 * r.clearance) & (1000 * r.clearance < high) for r in results]
+        asked = np.array([_asked(r, goals) for r, goals in zip(results, wanted) if goals.any()], bool)
+        if len(asked):
+            found[f"{low}-{high}" if high < np.inf else f"{low}-"] = rate(asked)
+    return found
 
 
 def _sorted(counts: Counter[str]) -> dict[str, int]:

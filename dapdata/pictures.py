@@ -16,7 +16,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dapdata import errors, records
-from dapdata.draw import POINT_RADIUS, Camera, Canvas, blank, draw_ground, draw_solids, frame, image, lit, paint, splat
+from dapdata.draw import (
+    POINT_RADIUS,
+    Camera,
+    Canvas,
+    Triangles,
+    blank,
+    draw_ground,
+    draw_solids,
+    frame,
+    image,
+    lit,
+    paint,
+    splat,
+    triangulate,
+)
+from dapdata.matching import hull_points
+from dapdata.poses import facing, transform
 
 Array = NDArray[Any]
 Sample = Mapping[str, Array]
@@ -26,6 +42,7 @@ INSET = 150  # px, of the two small pictures of the object
 GUTTER, ROW_TITLE, HEADER, FOOTER = 14, 40, 74, 118  # px
 BAR = PANEL[0] - 180  # px, length of a bar of colours
 DPI = 100
+JPEG = 82  # quality of pictures in pages
 SIDE, ABOVE = 0.42, 0.36  # the viewer stands this far aside and above, per unit in front of the opening
 WOOD, CLUTTER = (0.93, 0.90, 0.85), (0.70, 0.73, 0.79)
 VALID, DEMONSTRATED = (0.00, 0.62, 0.45), (0.96, 0.64, 0.00)
@@ -52,31 +69,43 @@ class Shown:
 
 
 def front_view(sample: Sample, width: int, height: int) -> Camera:
-    """The camera in front of the container's opening, a little aside and above, with the container in the picture."""
-    T_world_container = sample["pose/T_world_container"]
-    out = T_world_container[:3, :3] @ sample["scene/opening"]
-    out = np.array([out[0], out[1], 0.0])
+    """The camera in front of the container, a little aside and above, with the container and its goals in the picture."""
+    out = facing(sample["pose/T_world_container"], sample["scene/opening"])
     aside = np.array([out[1], -out[0], 0.0])  # to the viewer's left of the opening's direction
-    return frame(sample["container/points"].astype(float), out - SIDE * aside + [0, 0, ABOVE], width, height)
+    corners = hull_points(*(sample[f"object_parts/{name}"] for name in ("kind", "size", "T_object_part")))
+    placed = [transform(T_world_object, corners) for T_world_object in sample["goals/T_world_object"]]
+    return frame(
+        np.concatenate([sample["container/points"], *placed]).astype(float), out - SIDE * aside + [0, 0, ABOVE], width, height
+    )
 
 
 def draw_scene(canvas: Canvas, sample: Sample) -> None:
     """Adds the true parts of the container and of the clutter, and the table."""
-    color = np.where(sample["scene/role"][:, None] == records.ROLES.index("container"), [WOOD], [CLUTTER])
-    T_world_part = sample["pose/T_world_container"] @ sample["scene/T_container_part"]
-    draw_solids(canvas, sample["scene/kind"], sample["scene/size"], T_world_part, color)
+    parts = solids(sample)
+    for role, color in zip(records.ROLES, (WOOD, CLUTTER)):
+        draw_solids(canvas, parts[role].at(sample["pose/T_world_container"][None]), color)
     draw_ground(canvas, sample["pose/T_world_container"][:3, 3], radius=0.6)
+
+
+def solids(sample: Sample, sections: int = 64) -> dict[str, Triangles]:
+    """The true solids of a demo: the object in its own frame, container and clutter in the container's.
+
+    Args:
+        sample: One demo's arrays by shard path.
+        sections: Sides of a cylinder.
+    """
+    scene = [sample[f"scene/{name}"] for name in ("kind", "size", "T_container_part")]
+    object_ = [sample[f"object_parts/{name}"] for name in ("kind", "size", "T_object_part")]
+    of_role = {role: sample["scene/role"] == code for code, role in enumerate(records.ROLES)}
+    found = {role: triangulate(*(array[mine] for array in scene), sections=sections) for role, mine in of_role.items()}
+    return found | {"object": triangulate(*object_, sections=sections)}
 
 
 def draw_goals(
     canvas: Canvas, sample: Sample, T_world_object: Array, color: tuple[float, float, float], opacity: float, hidden: float
 ) -> None:
     """Adds the object's solids at (G, 4, 4) poses; `opacity` and `hidden` as in `draw_solids`."""
-    if not len(T_world_object):
-        return
-    T_world_part = (T_world_object[:, None] @ sample["object_parts/T_object_part"][None]).reshape(-1, 4, 4)
-    kind, size = (np.concatenate([sample[f"object_parts/{name}"]] * len(T_world_object)) for name in ("kind", "size"))
-    draw_solids(canvas, kind, size, T_world_part, color, opacity, hidden)
+    draw_solids(canvas, solids(sample)["object"].at(T_world_object), color, opacity, hidden)
 
 
 def is_demonstrated(sample: Sample) -> Array:
@@ -150,12 +179,13 @@ def _cloud_picture(sample: Sample, camera: Camera, seen: tuple[Array, Array], co
     return image(canvas)
 
 
-def png(pixels: Array) -> bytes:
-    """A picture as the bytes of a PNG file; the same bytes for the same picture."""
+def file(pixels: Array, kind: str = "png") -> bytes:
+    """A picture as the bytes of a PNG or JPEG file; the same bytes for the same picture."""
     from matplotlib import image as files
 
     buffer = io.BytesIO()
-    files.imsave(buffer, pixels, format="png", metadata={"Software": "dapdata"})
+    options = {"metadata": {"Software": "dapdata"}} if kind == "png" else {"pil_kwargs": {"quality": JPEG}}
+    files.imsave(buffer, pixels, format=kind, **options)
     return buffer.getvalue()
 
 
@@ -210,8 +240,8 @@ def _listed(codes: Array, names: tuple[str, ...]) -> str:
     return f"{len(codes)}" + (f" ({', '.join(f'{n} {name}' for name, n in counts.most_common())})" if counts else "")
 
 
-def sheet(shown: Sequence[Shown], heading: str) -> bytes:
-    """A contact sheet as the bytes of a PNG: one row per demo, columns and legends named."""
+def sheet(shown: Sequence[Shown], heading: str, kind: str = "png") -> bytes:
+    """A contact sheet as the bytes of a PNG or, kind "jpeg", a JPEG: one row per demo, columns and legends named."""
     tops = max(float(s.sample["container/points"][:, 2].max()) for s in shown)
     columns = [(INSET, "object"), *((PANEL[0], name) for name in ("cloud", "superpoints", "affordance", "goals"))]
     width = sum(w + GUTTER for w, _ in columns) + GUTTER
@@ -230,7 +260,7 @@ def sheet(shown: Sequence[Shown], heading: str) -> bytes:
         place.line(GUTTER, width - GUTTER, y + 3)
         _draw_row(place, panels(item.sample, tops), columns, y + ROW_TITLE)
     _legends(place, shown, tops, height - FOOTER, width)
-    return place.png()
+    return place.file(kind)
 
 
 COLUMN_TITLES = {
@@ -275,10 +305,11 @@ class Place:
             self.text(x + share * length, y + 24, label, size=9, color="#333", ha=align)
         self.text(x + length / 2, y - 10, name, size=10, color="#333", ha="center")
 
-    def png(self) -> bytes:
-        """The figure as the bytes of a PNG file; the same bytes for the same things on it."""
+    def file(self, kind: str = "png") -> bytes:
+        """The figure as the bytes of a PNG or JPEG file; the same bytes for the same things on it."""
         buffer = io.BytesIO()
-        self.figure.savefig(buffer, format="png", metadata={"Software": "dapdata"})
+        options = {"metadata": {"Software": "dapdata"}} if kind == "png" else {"pil_kwargs": {"quality": JPEG}}
+        self.figure.savefig(buffer, format=kind, **options)
         return buffer.getvalue()
 
 

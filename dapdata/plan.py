@@ -82,15 +82,14 @@ def before(root: Path) -> Before | None:
 
 def missing(layout: Layout, stage: str, units: Sequence[Unit]) -> list[Unit]:
     """The units of a stage that are not there."""
-    return [unit for unit in units if not store.is_committed(layout.folder(stage, unit))]
+    paths = [layout.path(stage, unit) for unit in units]
+    there = store.committed(layout.root, paths)
+    return [unit for unit, path in zip(units, paths) if path not in there]
 
 
 def measured_cost(root: Path, reference: Mapping[str, Cost]) -> dict[str, Cost]:
     """Seconds and bytes a demo in each stage: as last measured on this dataset, or else the reference."""
-    try:
-        lines = [json.loads(line) for line in (root / manifest.LOG).read_text().splitlines()[-LOG_LINES:]]
-    except (OSError, ValueError):
-        lines = []
+    lines = list(manifest.read_log(root, LOG_LINES))
     costs = dict(reference)
     for stage in reference:
         mine = [line for line in lines if line.get("stage") == stage and line["demos"]]
@@ -114,7 +113,7 @@ def make_plan(
     Args:
         layout: Where units are and what their keys are.
         stages: Those that the command runs, in order.
-        units: All units of the dataset.
+        units: Those of the dataset that the command is to look after.
         resolved: The recipe.
         previous: What the folder was made for before.
         cost: Seconds and bytes of one demo in each stage.
@@ -130,7 +129,8 @@ def make_plan(
         found.append(StagePlan(stage.name, len(units), len(units) - len(todo), demos, tuple(reasons)))
         seconds, size = seconds + demos * cost[stage.name][0], size + demos * cost[stage.name][1]
         files += len(todo) * _files_of_a_unit(stage, stages)
-    return Plan(str(layout.root), units[-1].stop, tuple(found), size / 1e9, files, seconds / 60)
+    asked = sum(unit.stop - unit.start for unit in units)
+    return Plan(str(layout.root), asked, tuple(found), size / 1e9, files, seconds / 60)
 
 
 def _files_of_a_unit(stage: Stage, stages: Sequence[Stage]) -> int:

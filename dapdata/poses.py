@@ -115,7 +115,32 @@ def symmetric_distance(T_a: Array, T_b: Array, kind: str, axis: Array) -> tuple[
     return float(np.linalg.norm(near[:3, 3] - T_b[:3, 3])), float(angle_between(near[:3, :3], T_b[:3, :3]))
 
 
-def tilt(T_world_object: Array, kind: str) -> float:
-    """Angle (rad) between the object's z axis and up; either end up counts where the symmetry flips it."""
-    cosine = T_world_object[2, 2]
-    return float(np.arccos(np.clip(abs(cosine) if kind != "none" else cosine, -1, 1)))
+def tilt(T_world_object: Array, kind: str, axis: Array) -> float:
+    """Smallest angle (rad) between the object's z axis and up, modulo the symmetry.
+
+    A cylinder that stands may stand on either end; a plate on its rim (revolution about y) may be rolled.
+
+    Args:
+        T_world_object: (4, 4) pose in a frame whose z is up.
+        kind: "none", "box" or "revolution".
+        axis: (3,) unit axis of revolution in the object frame; ignored for other kinds.
+    """
+    angle = float(np.arccos(np.clip(T_world_object[2, 2], -1, 1)))
+    if kind == "none":
+        return angle
+    if kind == "box":
+        return min(angle, np.pi - angle)
+    # Turned about the axis, z runs over a cone around it; reversed, over the opposite cone.
+    cone, lean = (float(np.arccos(np.clip(cosine, -1, 1))) for cosine in (axis[2], T_world_object[2, :3] @ axis))
+    return min(abs(lean - cone), abs(lean - (np.pi - cone)))
+
+
+def facing(T_world_container: Array, opening: Array) -> Array:
+    """(3,) horizontal unit vector, world frame, that a container faces: of an opening that points up, its x axis.
+
+    Args:
+        T_world_container: (4, 4); containers are only ever turned about the vertical.
+        opening: (3,) unit vector out of the opening, container frame.
+    """
+    level = np.array([opening[0], opening[1], 0.0]) if np.hypot(*opening[:2]) > 1e-6 else np.array([1.0, 0, 0])
+    return np.asarray(T_world_container[:3, :3] @ (level / np.linalg.norm(level)))

@@ -143,10 +143,10 @@ def _open_empty_sections(value: Any, schema: dict[str, Any], path: Location) -> 
 
 def _explain(source: Source, tree: Any, schema: dict[str, Any], error: Any) -> None:
     """Notes one of pydantic's errors as a problem in our words."""
-    path, found = _written_path(tree, error["loc"])
-    here = keys.at(schema, path)
+    path, typed, found = _written_path(tree, error["loc"])
+    here = keys.at(schema, typed)
     if error["type"] == "extra_forbidden":
-        source.blame(path, f"unknown key, {keys.known_name(path, schema)}")
+        source.blame(path, f"unknown key, {keys.known_name(typed, schema)}")
     elif error["type"] == "missing":
         path = error["loc"]
         source.blame(path, f"missing, expected {keys.allowed(keys.at(schema, path), schema)}")
@@ -156,16 +156,23 @@ def _explain(source: Source, tree: Any, schema: dict[str, Any], error: Any) -> N
         source.blame(path, f"got {keys.shown(found)}, expected {keys.allowed(here, schema)}{keys.meant(found, here)}")
 
 
-def _written_path(tree: Any, loc: Location) -> tuple[Location, Any]:
-    """The part of pydantic's location that was written down (it adds names of union members), and the value there."""
+def _written_path(tree: Any, loc: Location) -> tuple[Location, Location, Any]:
+    """The part of pydantic's location that was written down, the same with the tasks of scenes in a list, and the value there.
+
+    Pydantic adds the names of union members.
+    """
     path: Location = ()
+    typed: Location = ()
     for part in loc:
+        if isinstance(tree, dict) and part not in tree and tree.get("task") == part:
+            typed = (*typed, part)
+            continue
         try:
             tree = tree[part]
         except (KeyError, IndexError, TypeError):
             break
-        path = (*path, part)
-    return path, tree
+        path, typed = (*path, part), (*typed, part)
+    return path, typed, tree
 
 
 # Writing ---------------------------------------------------------------------------------------------------
@@ -206,5 +213,7 @@ def _commented(section: BaseModel, schema: dict[str, Any], path: Location) -> It
 
 
 def _yaml(value: Any) -> str:
-    """A value in YAML: JSON, but words without quotes."""
-    return value if isinstance(value, str) and re.fullmatch(r"[a-z]\w+", value) else json.dumps(value)
+    """A value in YAML: JSON, but words without quotes; of scenes in a list, what was written of them."""
+    if isinstance(value, str) and re.fullmatch(r"[a-z]\w+", value):
+        return value
+    return json.dumps(value, default=lambda scene: scene.model_dump(mode="json", exclude_unset=True))

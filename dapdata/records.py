@@ -9,7 +9,8 @@ from it, and each stage returns one of these records. A field's first dimension 
   `<group>/offsets (D+1,)` tells where each demo starts.
 
 Codes (small integers) carry their names in `names`. World frame: right-handed, z up, metres. The object
-frame has its origin at the centre of the object's bounding box and its z axis up at a goal.
+frame has its origin at the centre of the object's bounding box and its z axis up at a goal (of a mug,
+which hangs at its goals: up when it stands).
 """
 
 from __future__ import annotations
@@ -81,7 +82,8 @@ class Scene:
     T_container_goal: Array  # (G, 4, 4) f8, candidate poses of the object; each free slot once
     goal_kind: Array  # (G,) u1, index into GOAL_KINDS
     goal_clearance: Array  # (G,) f8, m, total free play along the tightest horizontal direction
-    opening: Array  # (3,) f8, unit, container frame: out of the container; objects come in against it
+    goal_approach: Array  # (G, 3) f8, unit, container frame: out of the place; the object comes in against it
+    opening: Array  # (3,) f8, unit, container frame: out of the container
     max_tilt: float  # rad, largest angle from upright that still counts as placed
     symmetry_kind: int  # index into SYMMETRIES
     symmetry_axis: Array  # (3,) f8, unit, object frame
@@ -89,6 +91,7 @@ class Scene:
     T_world_object_start: Array  # (4, 4) f8
     container_instance: int  # i8, digest of the container's and clutter's geometry
     object_instance: int  # i8, digest of the object's geometry
+    task: int = 0  # of a mixture: which of its tasks
 
 
 @dataclass(frozen=True)
@@ -106,6 +109,9 @@ class Demo:
     goal_kind: Array = array("goals/kind", "|u1", ("goal",), "1", "-", "what the goal rests on", GOAL_KINDS)
     goal_clearance: Array = array(
         "goals/clearance", "<f8", ("goal",), "m", "-", "total free play along the tightest horizontal direction"
+    )
+    goal_approach: Array = array(
+        "goals/approach", "<f8", ("goal", 3), "1", "container", "unit vector out of the place: the object comes in against it"
     )
     rejected_goals: Array = array(
         "rejected_goals/T_world_object", "<f8", ("rejected_goal", 4, 4), "m", "world", "candidates that failed, as proposed"
@@ -131,6 +137,7 @@ class Demo:
     container_instance: Array = array("meta/container_instance", "<i8", ("demo",), "1", "-", "digest of container and clutter")
     object_instance: Array = array("meta/object_instance", "<i8", ("demo",), "1", "-", "digest of the object's geometry")
     attempts: Array = array("meta/attempts", "<i8", ("demo",), "1", "-", "scenes drawn until this one was accepted")
+    task: Array = array("meta/task", "|u1", ("demo",), "1", "-", "of a mixture: place in the recipe's scene.scenes")
 
 
 @dataclass(frozen=True)

@@ -10,9 +10,10 @@ alone, which is enough to know what is there. A unit's arrays come when they are
   changed anything;
 - what is removed: a unit's root first.
 
-A store has no lock that dies with its holder. Writers take a lease: an object that names its holder and its end, made
-and renewed by conditional writes. It spares double work and keeps `gc` from units that a running command is about to
-name. What is published is safe without it: that rests on the conditional writes alone, and on nobody's clock.
+A store has no lock that dies with its holder. Where `durable.lock` locks a folder, a command here takes a lease: an
+object that names its holder and its end, made and renewed by conditional writes. It spares double work and keeps `gc`
+from units that a running command is about to name. What is published is safe without it: that rests on the conditional
+writes alone, and on nobody's clock.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ import shutil
 import tempfile
 import threading
 import time
+import weakref
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import fields, is_dataclass, replace
@@ -44,7 +46,8 @@ SCRATCH = "dapdata-copy-"
 ALIVE = "alive"  # file in a scratch folder that its process holds locked
 SETTLED = 60.0  # s: a scratch folder this old has its lock, if its process lives
 UNIT_ROOT = "zarr.json"
-SINGLE = (MANIFEST, manifest.INDEX, manifest.CARD, manifest.CROISSANT, manifest.PROGRESS, manifest.LOG)
+TABLES = (MANIFEST, manifest.INDEX)
+SINGLE = (*TABLES, manifest.UNITS, manifest.CARD, manifest.CROISSANT, manifest.PROGRESS, manifest.LOG)
 WITH_FILES = (manifest.PREVIEWS, "quarantine")
 WITH_UNITS = ("stages", "shards")  # and a folder between them and each unit
 LOOKS = 5  # at a dataset that is published anew while it is read
@@ -70,13 +73,16 @@ def locate(place: Place) -> Place:
 
 
 @contextmanager
-def working_copy(place: Place, *, files: Sequence[str] | None = None, units: bool = False) -> Iterator[Path]:
+def working_copy(
+    place: Place, *, files: Sequence[str] | None = None, units: bool = False, leftovers: bool = False
+) -> Iterator[Path]:
     """The dataset as a folder of this machine: the folder itself, or a working copy of one in a store.
 
     Args:
         place: The dataset's folder or URL.
         files: Single files to bring; all by default.
         units: Whether to bring the records of its units.
+        leftovers: Whether to bring the names of units that were not uploaded to their end.
 
     Raises:
         EnvironmentProblem: if the store cannot be reached, or refuses.
@@ -88,7 +94,7 @@ def working_copy(place: Place, *, files: Sequence[str] | None = None, units: boo
     with ExitStack() as stack:
         root = stack.enter_context(_scratch())
         stack.enter_context(_named(root, folder.url))
-        copy = Copy(folder, root)
+        copy = Copy(folder, root, leftovers)
         copy.pull_files(files)
         if units:
             copy.pull_units()
@@ -100,14 +106,14 @@ def working_copy(place: Place, *, files: Sequence[str] | None = None, units: boo
 
 
 def on_copy(
-    *, files: Sequence[str] | None = None, units: bool = False
+    *, files: Sequence[str] | None = None, units: bool = False, leftovers: bool = False
 ) -> Callable[[Callable[Concatenate[Path, Arguments], Result]], Callable[Concatenate[Place, Arguments], Result]]:
     """Decorates a function of a dataset's folder so that it takes a URL as well; arguments as for `working_copy`."""
 
     def decorate(call: Callable[Concatenate[Path, Arguments], Result]) -> Callable[Concatenate[Place, Arguments], Result]:
         @wraps(call)
         def on_any(root: Place, /, *args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
-            with working_copy(root, files=files, units=units) as path:
+            with working_copy(root, files=files, units=units, leftovers=leftovers) as path:
                 result = call(path, *args, **kwargs)
                 return _renamed(result, str(path), str(root).rstrip("/")) if is_url(root) else result
 
@@ -154,7 +160,7 @@ def size(folder: Path) -> int | None:
 def holder(root: Path) -> str | None:
     """Who works on the dataset now, as it said itself; None if nobody does."""
     copy = _copy(root)
-    return _holder(copy.folder.read(LEASE))[0] if copy else durable.holder(root)
+    return next((who for who, _ in _holders(copy.folder)), None) if copy else durable.holder(root)
 
 
 def scratch_of(root: Path) -> Path:
@@ -177,14 +183,39 @@ def unit(place: Place, path: str, arrays: Sequence[str] | None = None) -> Iterat
         yield root / path
 
 
+class Kept:
+    """Manifest and tables of a dataset, on this machine for as long as this object lives: columns are read from them."""
+
+    def __init__(self, place: Place) -> None:
+        self.url = str(place)
+        stack = ExitStack()
+        self.root = stack.enter_context(working_copy(place, files=TABLES))
+        self._end = weakref.finalize(self, _end_of, os.getpid(), stack)
+
+    @contextmanager
+    def named(self) -> Iterator[None]:
+        """Errors speak of the dataset by its own name."""
+        with _named(self.root, self.url):
+            yield
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Worker processes look where their parent keeps them."""
+        return {"url": self.url, "root": self.root}
+
+
+def _end_of(process: int, stack: ExitStack) -> None:
+    if process == os.getpid():  # and not a fork of it
+        stack.close()
+
+
 # The copy --------------------------------------------------------------------------------------------------
 
 
 class Copy:
     """A working copy and where it came from; the Mirror of what is made durable in it."""
 
-    def __init__(self, folder: Folder, root: Path) -> None:
-        self.folder, self.root = folder, root
+    def __init__(self, folder: Folder, root: Path, leftovers: bool) -> None:
+        self.folder, self.root, self.leftovers = folder, root, leftovers
         self.lease: Lease | None = None
         self.tag: str | None = None  # of the manifest as the holder of the lease knows it
 
@@ -198,7 +229,8 @@ class Copy:
         """Brings single files, all of one publication; where a name is nothing of ours, only the name."""
         for look in range(LOOKS):
             self._pull_manifest(names is None or MANIFEST in names)
-            wanted = self._single_files() if names is None else names
+            wanted = self._single_files() if names is None else [*names]
+            wanted += [manifest.UNITS] if manifest.UNITS in self._manifest().get("files", {}) else []
             self.folder.download((name for name in wanted if name != MANIFEST), self.root)
             if not self._is_torn():
                 break
@@ -228,7 +260,7 @@ class Copy:
                 _place(self.root, name, is_folder)
             elif name in SINGLE:
                 names.append(name)
-            elif name != LEASE:
+            elif not name.startswith(LEASE):
                 _place(self.root, name, is_folder)
         for name in WITH_FILES:
             if (self.root / name).is_dir():
@@ -252,20 +284,22 @@ class Copy:
     def pull_units(self) -> None:
         """Brings the records of all units that are not here yet, and takes away those that are gone."""
         if not self.folder.has_listing:
-            self.pull_records([entry.path for entry in manifest.units(manifest.read(self.root))])
+            found = manifest.read(self.root)
+            self.pull_records([entry.path for stage in found.stages.values() for entry in stage.units])
             return
-        found: set[str] = set()
+        there: set[str] = set()
         for top in WITH_UNITS:
             for group, is_group in self.folder.children(top).items():
                 _place(self.root / top, group, is_group)
                 children = self.folder.children(f"{top}/{group}") if is_group and is_inside(group) else {}
                 for child, is_folder in children.items():
-                    _place(self.root / top / group, child, is_folder)
-                found |= {f"{top}/{group}/{child}" for child, is_folder in children.items() if is_folder}
+                    if self.leftovers or not is_folder:
+                        _place(self.root / top / group, child, is_folder)
+                there |= {f"{top}/{group}/{child}" for child, is_folder in children.items() if is_folder}
             for here in self.root.glob(f"{top}/*/*"):
-                if here.is_dir() and self.name(here) not in found:
+                if here.is_dir() and self.name(here) not in there:
                     shutil.rmtree(here)
-        self.pull_records(sorted(found))
+        self.pull_records(sorted(there))
 
     def pull_records(self, units: Iterable[str]) -> None:
         """Brings the records of these units, as far as they are there and not here yet."""
@@ -293,14 +327,14 @@ class Copy:
     # What is made durable here is repeated there: see durable.Mirror
 
     @contextmanager
-    def hold(self) -> Iterator[None]:
-        """Takes the lease, and brings what others have published until now.
+    def hold(self, shared: bool, deadline: float) -> Iterator[None]:
+        """Takes the lease, and brings what others have made and published until now.
 
         Raises:
             LockedError: if another command holds it.
         """
-        self.lease = Lease(self.folder)
-        with self.lease.held():
+        self.lease = Lease(self.folder, shared)
+        with self.lease.held(deadline):
             self.pull_files(None)
             self.pull_units()
             log = self.root / manifest.LOG
@@ -326,12 +360,12 @@ class Copy:
         self.fill(folder)
         return False
 
-    def replace(self, path: Path, data: bytes) -> None:
-        """Writes an object; the manifest on the condition that nobody else did."""
+    def replace(self, path: Path) -> None:
+        """Uploads a file; the manifest on the condition that nobody else did."""
         if self.name(path) == MANIFEST:
-            self._write_manifest(data)
+            self._write_manifest(path.read_bytes())
         else:
-            self.folder.write(self.name(path), data)
+            self.folder.upload(self.root, [self.name(path)])
 
     def remove(self, path: Path) -> None:
         """Removes an object, or all of a folder; a note takes the manifest's place, on the same condition."""
@@ -343,7 +377,7 @@ class Copy:
             roots = {each for each in names if each.count("/") == 3 and each.endswith(f"/{UNIT_ROOT}")}
             self.folder.remove(roots)
             self.folder.remove(names - roots)
-        else:
+        elif path.exists():
             self.folder.remove([name])
 
     def _write_manifest(self, data: bytes) -> None:
@@ -413,16 +447,28 @@ def _renamed(value: Any, old: str, new: str) -> Any:
 
 
 class Lease:
-    """The right of one command at a time to write to a dataset: an object with its holder and its end."""
+    """The right to write to a dataset: an object with its holder and its end.
 
-    def __init__(self, folder: Folder) -> None:
-        self.folder, self.tag, self.lost = folder, "", False
+    One command has it for itself, under a name that there is once; or several share it, each under a name of its own.
+    Both kinds first write theirs and then look for the other: so it may be that neither gets it, but never that both do.
+    """
+
+    def __init__(self, folder: Folder, shared: bool) -> None:
+        self.folder, self.shared, self.tag, self.lost = folder, shared, "", False
+        self.name = f"{LEASE}-{durable.digest([_machine(), os.getpid(), time.time_ns()])[:16]}" if shared else LEASE
         self._turn, self._over = threading.Lock(), threading.Event()
 
     @contextmanager
-    def held(self) -> Iterator[None]:
-        """Holds it, renewed now and then."""
-        self.take()
+    def held(self, deadline: float) -> Iterator[None]:
+        """Holds it, renewed now and then; waits for it until a time of the monotonic clock."""
+        while True:
+            try:
+                self.take()
+                break
+            except LockedError:
+                if time.monotonic() >= deadline:
+                    raise
+            time.sleep(PAUSE)
         threading.Thread(target=self.keep, daemon=True).start()
         try:
             yield
@@ -437,24 +483,24 @@ class Lease:
             EnvironmentProblem: if the store takes no notice of conditions.
         """
         self.folder.require_writable()
-        found = self.folder.read_tagged(LEASE)
-        who, left = _holder(found[0] if found else None)
-        if who is not None:
-            raise LockedError(
-                f"{self.folder.url}: in use by {who}; wait for it to end, or stop it, and run again "
-                f"(if it died on another machine, its lease ends in {left:.0f} s)"
-            )
+        found = self.folder.read_tagged(self.name)
+        _refuse(self.folder, [_alive(found[0])] if found else [])
         try:
-            self.tag = self.folder.write_if(LEASE, self._claim(), found[1] if found else None)
+            self.tag = self.folder.write_if(self.name, self._claim(), found[1] if found else None)
         except Conflict as error:
             raise LockedError(f"{self.folder.url}: another command began this moment; wait for it to end") from error
-        self._check_conditions()
+        try:
+            self._check_conditions()
+            _refuse(self.folder, _holders(self.folder, alone=self.shared, sharing=not self.shared))
+        except DapdataError:
+            self._drop()
+            raise
 
     def _check_conditions(self) -> None:
         """Raises an EnvironmentProblem if the store writes although its condition is not met."""
         for tag in (None, '"0"'):
             with suppress(Conflict):
-                self.folder.write_if(LEASE, self._claim(), tag)
+                self.folder.write_if(self.name, self._claim(), tag)
                 raise EnvironmentProblem(
                     f"{self.folder.url}: the store writes whatever the conditions (If-None-Match, If-Match), expected one that "
                     "heeds them; generate into a folder and copy it, manifest.json last"
@@ -474,7 +520,7 @@ class Lease:
         """
         with self._turn:
             try:
-                self.tag = "" if self.lost else self.folder.write_if(LEASE, self._claim(), self.tag)
+                self.tag = "" if self.lost else self.folder.write_if(self.name, self._claim(), self.tag)
             except Conflict:
                 self.lost = True
         if self.lost:
@@ -493,19 +539,38 @@ class Lease:
         """Removes the object, unless it is another's by now."""
         self._over.set()
         if not self.lost:
-            with suppress(EnvironmentProblem):  # it ends by itself
-                self.folder.remove([LEASE])
+            self._drop()
+
+    def _drop(self) -> None:
+        with suppress(EnvironmentProblem):  # it ends by itself
+            self.folder.remove([self.name])
 
 
-def _holder(data: bytes | None) -> tuple[str | None, float]:
+def _refuse(folder: Folder, holders: Iterable[tuple[str, float] | None]) -> None:
+    """Raises a LockedError if there is a holder."""
+    for who, left in filter(None, holders):
+        raise LockedError(
+            f"{folder.url}: in use by {who}; wait for it to end, or stop it, and run again "
+            f"(if it died on another machine, its lease ends in {left:.0f} s)"
+        )
+
+
+def _holders(folder: Folder, alone: bool = True, sharing: bool = True) -> Iterator[tuple[str, float]]:
+    """Who holds the lease of a dataset alone, and who shares it, with the seconds until it ends."""
+    names = [LEASE] if alone else []
+    names += [name for name in folder.children() if name.startswith(f"{LEASE}-")] if sharing else []
+    yield from filter(None, (_alive(folder.read(name)) for name in names))
+
+
+def _alive(data: bytes | None) -> tuple[str, float] | None:
     """Who holds a lease, and for how many seconds yet; None if nobody does any more."""
     try:
         found = json.loads(data or b"{}")
         who, left = str(found["holder"]), float(found["until"]) - time.time()
         gone = found["machine"] == _machine() and not Path("/proc", str(int(found["pid"]))).exists()
     except (ValueError, KeyError, TypeError):
-        return None, 0.0
-    return (None, 0.0) if gone or left < 0 else (who, left)
+        return None
+    return None if gone or left < 0 else (who, left)
 
 
 def _machine() -> str:

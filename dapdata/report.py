@@ -54,6 +54,10 @@ class Success(Part):
         "that head for one succeeds within 2 cm of it"
     )
     success_top1_tight: Interval = Field(description="the same scenes: top-1, free to choose, succeeds within 2 cm of one")
+    success_by_clearance_mm: dict[str, Interval] = Field(
+        default_factory=dict,
+        description="success_tight for goals of each range of clearance, such as 5-10 mm, over the scenes that have one",
+    )
     failures: dict[str, int] = Field(description="top-1 failures by reason, no_prediction among them")
     failures_all: dict[str, int] = Field(description="failures of all K candidates by reason")
 

@@ -27,9 +27,11 @@ def schema(kind: str) -> dict[str, Any]:
 
         return json_schema()
     if kind == "manifest":
-        from dapdata.manifest import Manifest
+        from pydantic import TypeAdapter
 
-        return {"$schema": DIALECT, **Manifest.model_json_schema()}
+        from dapdata.manifest import LargeManifest, Manifest
+
+        return {"$schema": DIALECT, **TypeAdapter(Manifest | LargeManifest).json_schema()}
     if kind == "report":
         from dapdata.report import json_schema as report_schema
 

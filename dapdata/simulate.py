@@ -5,8 +5,11 @@ in one simulation a scene that is built from nothing, so that a result does not 
 Containers and clutter are fixed, as in RPDiff. Several copies of the object share a simulation without seeing each other.
 
 The judge's motion decides both whether a candidate goal can be reached and whether a prediction can be executed: the
-object is held (teleported) in its rotation and moved in against the opening. A held body pushes with no force in a rigid
-simulator; its push is stated as depth of overlap x PUSH_STIFFNESS.
+object is held (teleported) in its rotation and moved in against the approach of the place it goes to, which is the
+container's opening, or along a peg. A held body pushes with no force in a rigid simulator; its push is stated as depth of
+overlap x PUSH_STIFFNESS.
+
+What hangs (on a peg) swings into place: its candidates are let go for HANG_SECONDS first, and are what they come to.
 """
 
 from __future__ import annotations
@@ -23,8 +26,8 @@ from numpy.typing import NDArray
 from dapdata import solids
 from dapdata.config import Section, key
 from dapdata.errors import UsageError, require
-from dapdata.poses import inverse, pose, rotation_about, symmetric_distance, tilt
-from dapdata.records import PART_KINDS, REJECT_REASONS, ROLES, SYMMETRIES, Demo, Rejected, Scene, Verdict
+from dapdata.poses import inverse, pose, rotation_about, symmetric_distance, tilt, transform
+from dapdata.records import GOAL_KINDS, PART_KINDS, REJECT_REASONS, ROLES, SYMMETRIES, Demo, Rejected, Scene, Verdict
 
 Array = NDArray[Any]
 
@@ -42,7 +45,12 @@ PUSH_STIFFNESS = 7500.0  # N/m: 15 N at 2 mm of overlap, the depth that a protot
 STRICT_SECONDS = 2.0  # s of physics after the release
 TOUCH = 0.001  # m: closer than this is a contact; resting bodies are within 0.02 mm
 SUPPORTING = 0.5  # cosine: a contact holds up if its normal is within 60 degrees of up
+RIM = 0.002  # m: an object in a container that opens upwards reaches at least so far below its top
 GAP_RANGE = 0.05  # m: gaps under an object are looked for this far
+MAX_PARTS = 16  # of an object: PyBullet makes no shape of more, and says nothing
+HANG_SECONDS = 1.0  # s until a mug that was put onto a peg hangs still; most do after 0.4
+HANG_SHIFT = 0.1  # m: one that came further has fallen off
+HANG_ROLLING = 0.001  # rolling and spinning friction of what hangs: without it, mugs jitter on a peg at up to 9 mm/s
 
 RPDIFF_SECONDS = 1.0  # s of physics after the release
 RPDIFF_ATTEMPTS = 11
@@ -82,7 +90,7 @@ def demonstrate(scene: Scene, config: PlacementConfig, rng: np.random.Generator)
     """
     if len(scene.T_container_goal) == 0:
         return Rejected("no_free_slot")
-    settled, reasons = settle(scene, scene.T_container_goal, config)
+    settled, reasons = settle(scene, scene.T_container_goal, config, scene.goal_approach)
     kept = [g for g, reason in enumerate(reasons) if reason == "ok"]
     lost = [g for g, reason in enumerate(reasons) if reason != "ok"]
     codes = [REJECT_REASONS.index(reasons[g]) for g in lost]
@@ -96,6 +104,7 @@ def demonstrate(scene: Scene, config: PlacementConfig, rng: np.random.Generator)
         goals=goals,
         goal_kind=scene.goal_kind[kept],
         goal_clearance=scene.goal_clearance[kept],
+        goal_approach=scene.goal_approach[kept],
         rejected_goals=scene.T_world_container @ scene.T_container_goal[lost],
         rejected_reason=np.array(codes, np.uint8),
         symmetry_kind=np.array(scene.symmetry_kind, np.uint8),
@@ -114,10 +123,13 @@ def demonstrate(scene: Scene, config: PlacementConfig, rng: np.random.Generator)
         container_instance=np.array(scene.container_instance),
         object_instance=np.array(scene.object_instance),
         attempts=np.array(0),
+        task=np.array(scene.task),
     )
 
 
-def settle(scene: Scene | Demo, T_container_object: Array, config: PlacementConfig) -> tuple[Array, list[str]]:
+def settle(
+    scene: Scene | Demo, T_container_object: Array, config: PlacementConfig, approach: Array | None = None
+) -> tuple[Array, list[str]]:
     """Where candidate poses come to rest, and "ok" or the first reason against each.
 
     A candidate must overlap nothing and have something under it; is then let go for `settle_seconds`, after which it must
@@ -128,12 +140,14 @@ def settle(scene: Scene | Demo, T_container_object: Array, config: PlacementConf
         scene: What the container, its clutter and the object look like.
         T_container_object: (G, 4, 4) candidate poses.
         config: Limits and durations.
+        approach: (G, 3) unit, container frame: against which the judge's motion brings each of them in. Default: that of
+            the scene's goal (or candidate) nearest to each, as for predictions.
 
     Returns:
         (G, 4, 4) poses before shaking (of candidates that were not let go: as given), and G reasons.
     """
+    poses = _hung(scene, T_container_object, config) if _hangs(scene) else np.array(T_container_object, np.float64)
     world = _World(scene, config)
-    poses = np.array(T_container_object, np.float64)
     reasons = [_reason_before(world, T, config) for T in poses]
     alive = [g for g, reason in enumerate(reasons) if reason == "ok"]
     bodies = world.release(poses[alive])
@@ -146,7 +160,8 @@ def settle(scene: Scene | Demo, T_container_object: Array, config: PlacementConf
     for g, T, speed in zip(alive, shaken, speeds):
         if reasons[g] == "ok" and _reason_after(world, poses[g], T, speed, config) != "ok":
             reasons[g] = "shaken_off"
-        if reasons[g] == "ok" and _approach(world, poses[g]).T_release is None:
+        way_out = world.way_out(poses[g]) if approach is None else approach[g]
+        if reasons[g] == "ok" and _approach(world, poses[g], way_out).T_release is None:
             reasons[g] = "unreachable"
     return poses, reasons
 
@@ -157,7 +172,7 @@ def judge(
     """What becomes of each of K predicted placements when it is executed, each on its own.
 
     Args:
-        demo: The scene; its goals are not looked at.
+        demo: The scene. Of its goals only the approach is used: a prediction is executed as the goal nearest to it would be.
         T_world_object: (K, 4, 4) predictions. Rows that are not finite are failures with the reason "no_prediction",
             other matrices that are no rigid motion "invalid_pose".
         config: Mass, friction and the limits.
@@ -197,12 +212,29 @@ def judge(
 # ---------------------------------------------------------------- the checks of a candidate goal
 
 
+def _hangs(scene: Scene | Demo) -> bool:
+    """Whether there is a peg among the places."""
+    return bool(np.any(scene.goal_kind == GOAL_KINDS.index("peg")))
+
+
+def _hung(scene: Scene | Demo, T_container_object: Array, config: PlacementConfig) -> Array:
+    """(G, 4, 4) what candidates come to that are let go on a peg; those that overlap something or fall off, as given."""
+    world, poses = _World(scene, config), np.array(T_container_object, np.float64)
+    free = [g for g, T in enumerate(poses) if _depth(world.contacts(T, 0.0)) <= config.max_penetration]
+    bodies = world.release(poses[free])
+    world.run(HANG_SECONDS)
+    for g, T in zip(free, world.states(bodies)[0]):
+        if world.difference(T, poses[g])[0] <= HANG_SHIFT:
+            poses[g] = T
+    return poses
+
+
 def _reason_before(world: _World, T: Array, config: PlacementConfig) -> str:
     """Whether a candidate overlaps something or has nothing under it."""
     contacts = world.contacts(T, config.support_gap)
     if _depth(contacts) > config.max_penetration:
         return "penetrates"
-    return "ok" if _is_supported(contacts) else "unsupported"
+    return "ok" if world.is_held(T, contacts) else "unsupported"
 
 
 def _reason_after(world: _World, T_before: Array, T: Array, speed: float, config: PlacementConfig) -> str:
@@ -219,7 +251,7 @@ def _reason_after(world: _World, T_before: Array, T: Array, speed: float, config
     contacts = world.contacts(T, config.support_gap)
     if _depth(contacts) > config.max_penetration:
         return "penetrates"
-    return "ok" if _is_supported(contacts) else "unsupported"
+    return "ok" if world.is_held(T, contacts) else "unsupported"
 
 
 def _shake(world: _World, bodies: Sequence[int], config: PlacementConfig) -> tuple[Array, Array]:
@@ -243,6 +275,7 @@ class _Contact(NamedTuple):
 
     distance: float  # m, negative where they overlap
     normal: Array  # (3,) unit, from the part to the object
+    height: float  # m, container frame, of the point on the part
 
 
 @dataclass(frozen=True)
@@ -268,15 +301,15 @@ def _try(world: _World, T: Array, protocol: Protocol) -> _Trial:
     contacts = world.contacts(T, GAP_RANGE)
     below = [contact.distance / contact.normal[2] for contact in contacts if contact.normal[2] > SUPPORTING]
     gap = float(np.clip(min(below, default=GAP_RANGE), 0, GAP_RANGE))
-    held = _approach(world, T) if protocol == "strict" else _approach_rpdiff(world, T)
+    held = _approach(world, T, world.way_out(T)) if protocol == "strict" else _approach_rpdiff(world, T)
     return _Trial(T, held, _depth(contacts), gap)
 
 
-def _approach(world: _World, T: Array) -> _Held:
-    """The object moved in against the opening, above its place, and lowered until it touches something below."""
+def _approach(world: _World, T: Array, way_out: Array) -> _Held:
+    """The object moved in against the way out (3,), above its place, and lowered until it touches something below."""
     lift = min(LIFT, world.free_height(T) / 2)
     ways = np.arange(round(APPROACH / APPROACH_STEP), -1, -1) * APPROACH_STEP
-    _, push = _travel(world, T, lift * UP + ways[:, None] * world.opening)
+    _, push = _travel(world, T, lift * UP + ways[:, None] * way_out)
     if push > MAX_PUSH:
         return _Held(None, push)
     heights = lift - np.arange(int(np.ceil((lift + LOWEST) / LOWER_STEP)) + 1) * LOWER_STEP
@@ -309,16 +342,16 @@ def _approach_rpdiff(world: _World, T: Array) -> _Held:
     """
     if world.symmetry == "none":
         return _Held(T, 0.0)
-    start, push, release = round(APPROACH / APPROACH_STEP), 0.0, T
-    sideways = np.cross(UP, world.opening)
+    start, push, release, way_out = round(APPROACH / APPROACH_STEP), 0.0, T, world.way_out(T)
+    sideways = np.cross(UP, way_out)
     for attempt in range(RPDIFF_ATTEMPTS if world.symmetry == "box" else 1):
         shift, turn = RPDIFF_JITTERS[attempt % len(RPDIFF_JITTERS)] if attempt else (0.0, 0.0)
         turned = pose(rotation_about(UP, np.radians(turn)) @ T[:3, :3], T[:3, 3] + shift * sideways)
         ways = np.arange(start, -1, -1) * APPROACH_STEP
-        step, push = _travel(world, turned, ways[:, None] * world.opening)
+        step, push = _travel(world, turned, ways[:, None] * way_out)
         if world.symmetry == "revolution":
             return _Held(None if push > MAX_PUSH else T, push)
-        release = _moved(turned, ways[step] * world.opening)
+        release = _moved(turned, ways[step] * way_out)
         if np.linalg.norm(release[:3, 3] - T[:3, 3]) <= RPDIFF_REACHED:
             break
         start = min(round((ways[step] + RPDIFF_BACK_OFF) / APPROACH_STEP), round(APPROACH / APPROACH_STEP))
@@ -330,15 +363,15 @@ def _verdict(
 ) -> Verdict:
     """What is said about an object that was let go and ended at T (container frame)."""
     moved, turned = world.difference(T, trial.T)
-    is_touching = bool(world.contacts(T, TOUCH))
-    failed = {"not_touching": not is_touching}
+    contacts = world.contacts(T, TOUCH)
+    failed = {"not_touching": not contacts}
     if protocol == "strict":
         failed = {
             "outside": not world.is_inside(T),
             "moved": moved > config.max_shift,
             "turned": turned > np.radians(config.max_turn_deg),
             "tilted": world.tilt(T) > world.max_tilt,
-            "not_touching": not is_touching,
+            "not_touching": not (world.is_held(T, contacts) if world.hangs else contacts),
             "not_at_rest": speed > config.max_speed,
         }
     elif world.symmetry == "revolution":
@@ -386,11 +419,6 @@ def _push(contacts: Sequence[_Contact]) -> float:
     return PUSH_STIFFNESS * max(_depth(contacts), 0.0)
 
 
-def _is_supported(contacts: Sequence[_Contact]) -> bool:
-    """Whether one of the contacts holds the object up."""
-    return any(contact.normal[2] > SUPPORTING for contact in contacts)
-
-
 # ---------------------------------------------------------------- PyBullet
 
 
@@ -420,13 +448,15 @@ class _World:
     """A simulation of one scene: fixed parts, a held copy of the object to measure with, and copies that fall."""
 
     def __init__(self, scene: Scene | Demo, config: PlacementConfig, exhaustive: bool = False) -> None:
-        self.opening = np.asarray(scene.opening, np.float64)
+        self._places, self._ways_out = _places(scene), np.asarray(scene.goal_approach, np.float64)
+        self.hangs, self._opens_up = _hangs(scene), bool(scene.opening[2] > SUPPORTING)
         self.max_tilt = float(scene.max_tilt)
         self.symmetry = SYMMETRIES[int(scene.symmetry_kind)]
         self._axis = np.asarray(scene.symmetry_axis, np.float64)
         self._exhaustive = exhaustive
         self._config = config
         self._object = tuple(np.asarray(x) for x in (scene.object_kind, scene.object_size, scene.T_object_part))
+        self._T_object_body = _object_body(*self._object)
         parts = tuple(np.asarray(x) for x in (scene.part_kind, scene.part_size, scene.T_container_part))
         for name, arrays in (("container part", parts), ("object part", self._object)):
             _check_solids(name, *arrays)
@@ -435,8 +465,8 @@ class _World:
         self._inside = np.stack([container[:, 0].min(axis=0), container[:, 1].max(axis=0)])
         self._bullet, self._client = _client(os.getpid())
         self._start()
-        self._parts = [self._body(0.0, *(x[p : p + 1] for x in parts)) for p in range(len(parts[0]))]
-        self._probe = self._body(0.0, *self._object)
+        self._parts = [self._body(0.0, T, self._shape(int(kind), size)) for kind, size, T in zip(*parts)]
+        self._probe = self._copy(0.0, np.eye(4))
         self._bullet.setCollisionFilterGroupMask(self._probe, -1, 0, 0, physicsClientId=self._client)
 
     def _start(self) -> None:
@@ -452,23 +482,26 @@ class _World:
         self._visual = b.createVisualShape(b.GEOM_BOX, halfExtents=[0.01] * 3, physicsClientId=client)
         self.pull(0, 0)
 
-    def _body(self, mass: float, kind: Array, size: Array, T: Array) -> int:
-        """A body of one or more solids; a single solid's pose is the body's, several are placed in the body's frame."""
+    def _body(self, mass: float, T: Array, shape: int) -> int:
+        """A body of a shape at a pose."""
         b = self._bullet
-        is_single = len(kind) == 1
-        position, quaternion = _to_bullet(T[0] if is_single else np.eye(4))
         body: int = b.createMultiBody(
-            mass,
-            self._shape(int(kind[0]), size[0]) if is_single else self._compound(kind, size, T),
-            self._visual,
-            position,
-            quaternion,
-            useMaximalCoordinates=1,
-            physicsClientId=self._client,
+            mass, shape, self._visual, *_to_bullet(T), useMaximalCoordinates=1, physicsClientId=self._client
         )
         if self._config.friction != 0.5:  # PyBullet's default
             b.changeDynamics(body, -1, lateralFriction=self._config.friction, physicsClientId=self._client)
+        if self.hangs:
+            rolling = {"rollingFriction": HANG_ROLLING, "spinningFriction": HANG_ROLLING}
+            b.changeDynamics(body, -1, **rolling, physicsClientId=self._client)
         return body
+
+    def _copy(self, mass: float, T: Array) -> int:
+        """A copy of the object at T."""
+        kind, size, T_object_part = self._object
+        if len(kind) == 1:
+            return self._body(mass, T @ self._T_object_body, self._shape(int(kind[0]), size[0]))
+        T_body_part = inverse(self._T_object_body) @ T_object_part
+        return self._body(mass, T @ self._T_object_body, self._compound(kind, size, T_body_part))
 
     def _shape(self, kind: int, size: Array) -> int:
         """The collision shape of one solid."""
@@ -524,31 +557,61 @@ class _World:
         b, client = self._bullet, self._client
         if not len(parts):
             return []
-        b.resetBasePositionAndOrientation(self._probe, *self._body_pose(T), physicsClientId=client)
+        b.resetBasePositionAndOrientation(self._probe, *_to_bullet(T @ self._T_object_body), physicsClientId=client)
         found = []
         for p in parts:
             for point in b.getClosestPoints(self._probe, self._parts[p], reach, physicsClientId=client):
-                found.append(_Contact(point[8], np.array(point[7])))
+                found.append(_Contact(point[8], np.array(point[7]), point[6][2]))
         return found
 
+    def way_out(self, T: Array) -> Array:
+        """(3,) unit vector out of the place nearest to an object at T, against which it is brought in."""
+        return np.asarray(self._ways_out[np.linalg.norm(self._places - T[:3, 3], axis=1).argmin()])
+
     def free_height(self, T: Array) -> float:
-        """Height (m) between the object's top and what is above it, by bounding boxes; infinite under open sky."""
+        """Height (m) between the object's top and what is above it, by bounding boxes; infinite under open sky.
+
+        Around what hangs there is a handle: contacts tell how far that can be raised.
+        """
+        if self.hangs:
+            return self._free_height_of_hanging(T)
         low, high = self._object_bounds(T)
         over = np.all((self._bounds[:, 0, :2] < high[:2]) & (self._bounds[:, 1, :2] > low[:2]), axis=1)
         over &= self._bounds[:, 0, 2] > (low[2] + high[2]) / 2
         return max(float((self._bounds[over, 0, 2] - high[2]).min(initial=np.inf)), 0.0)
 
+    def _free_height_of_hanging(self, T: Array) -> float:
+        """Height (m), up to twice LIFT, until something presses on the object from above."""
+        heights = np.arange(round(2 * LIFT / APPROACH_STEP) + 1) * APPROACH_STEP
+        for step, contacts in self.contacts_along(T, heights[:, None] * UP):
+            if any(contact.distance < 0 and contact.normal[2] < -SUPPORTING for contact in contacts):
+                return float(heights[max(step - 1, 0)])
+        return 2 * LIFT
+
     def is_inside(self, T: Array) -> bool:
-        """Whether the object's centre is in the container's bounding box."""
-        return bool(np.all((T[:3, 3] >= self._inside[0]) & (T[:3, 3] <= self._inside[1])))
+        """Whether the object's centre is in the container's bounding box; if that opens upwards, the centre of its underside.
+
+        What stands in a hole sticks out of it, but reaches further down than what stands on the rim.
+        """
+        x, y, z = T[:3, 3]
+        point = np.array([x, y, self._object_bounds(T)[0, 2] + RIM if self._opens_up else z])
+        return bool(np.all((point >= self._inside[0]) & (point <= self._inside[1])))
+
+    def is_held(self, T: Array, contacts: Sequence[_Contact]) -> bool:
+        """Whether one of the contacts holds the object up; what hangs, from above its centre of mass.
+
+        A mug that stands at the foot of its rack does not hang.
+        """
+        lowest = (T @ self._T_object_body)[2, 3] if self.hangs else -np.inf
+        return any(contact.normal[2] > SUPPORTING and contact.height > lowest for contact in contacts)
 
     def difference(self, T_a: Array, T_b: Array) -> tuple[float, float]:
         """Distance (m) and angle (rad) between two poses modulo the object's symmetry."""
         return symmetric_distance(T_a, T_b, self.symmetry, self._axis)
 
     def tilt(self, T: Array) -> float:
-        """Angle (rad) of the object from upright."""
-        return tilt(T, self.symmetry)
+        """Angle (rad) of the object from upright, modulo its symmetry."""
+        return tilt(T, self.symmetry, self._axis)
 
     def _object_bounds(self, T: Array) -> Array:
         """(2, 3) low and high corner of the object's bounding box at T."""
@@ -560,13 +623,9 @@ class _World:
 
     def release(self, T: Sequence[Array] | Array) -> list[int]:
         """Copies of the object, at rest at each of T, that see the parts but not each other."""
-        kind, size, T_object_part = self._object
         bodies = []
         for each in T:
-            is_single = len(kind) == 1
-            body = self._body(self._config.mass, kind, size, (each @ T_object_part) if is_single else T_object_part)
-            if not is_single:
-                self._bullet.resetBasePositionAndOrientation(body, *_to_bullet(each), physicsClientId=self._client)
+            body = self._copy(self._config.mass, each)
             # PyBullet puts fixed bodies into group 2.
             self._bullet.setCollisionFilterGroupMask(body, -1, 1, 2, physicsClientId=self._client)
             bodies.append(body)
@@ -586,18 +645,22 @@ class _World:
         b, client = self._bullet, self._client
         poses = np.zeros((len(bodies), 4, 4))
         for i, body in enumerate(bodies):
-            poses[i] = self._object_pose(*b.getBasePositionAndOrientation(body, physicsClientId=client))
+            T = _from_bullet(*b.getBasePositionAndOrientation(body, physicsClientId=client))
+            poses[i] = T @ inverse(self._T_object_body)
         speeds = [np.linalg.norm(b.getBaseVelocity(body, physicsClientId=client)[0]) for body in bodies]
         return poses, np.array(speeds, np.float64)
 
-    def _body_pose(self, T: Array) -> tuple[list[float], list[float]]:
-        """PyBullet's pose of a copy of the object at T: that of its solid if it has only one."""
-        return _to_bullet(T @ self._object[2][0] if len(self._object[0]) == 1 else T)
 
-    def _object_pose(self, position: Sequence[float], quaternion: Sequence[float]) -> Array:
-        """The inverse of `_body_pose`."""
-        T = _from_bullet(position, quaternion)
-        return T @ inverse(self._object[2][0]) if len(self._object[0]) == 1 else T
+def _object_body(kind: Array, size: Array, T_object_part: Array) -> Array:
+    """(4, 4) the frame of PyBullet's body in the object's: that of its solid, or at the centre of mass of several."""
+    return T_object_part[0] if len(kind) == 1 else pose(None, solids.centre_of_mass(kind, size, T_object_part))
+
+
+def _places(scene: Scene | Demo) -> Array:
+    """(G, 3) positions of a scene's candidates or a demo's goals, container frame, m."""
+    if isinstance(scene, Scene):
+        return scene.T_container_goal[:, :3, 3]
+    return transform(inverse(scene.T_world_container), scene.goals[:, :3, 3])
 
 
 def _check_solids(name: str, kind: Array, size: Array, T: Array) -> None:
@@ -610,6 +673,8 @@ def _check_solids(name: str, kind: Array, size: Array, T: Array) -> None:
         )
     if name == "object part" and len(kind) > 1 and np.any(kind == solids.ELLIPSOID):
         raise UsageError(f"{name}: got an ellipsoid among {len(kind)} parts, expected boxes and cylinders; use it on its own")
+    if name == "object part" and len(kind) > MAX_PARTS:
+        raise UsageError(f"{name}: got {len(kind)}, expected {MAX_PARTS} at the most; build the object from fewer")
     if not (np.all(np.isfinite(T)) and np.all(np.isfinite(size)) and np.all(size > 0)):
         raise UsageError(f"{name}: got sizes or poses that are not finite or not positive, expected metres; correct the scene")
 

@@ -74,6 +74,35 @@ def open_shelf(width: float, depth: float, pitch: float, shelves: int, board: fl
     return [*floors, back, *sides, *top]
 
 
+def plate_with_holes(x: Array, y: Array, opening: float, margin: tuple[float, float], bottom: float, top: float) -> list[Part]:
+    """A level plate with a grid of square holes, as boxes that meet without overlap: bars along y, and short ones between.
+
+    Args:
+        x: (R,) places of the holes along x, rising, m.
+        y: (C,) the same along y.
+        opening: Side of the holes, m; less than any two are apart.
+        margin: Plate beyond the outermost holes along x and along y, m.
+        bottom: Height of the underside, m.
+        top: Height of the upper face, m.
+    """
+    across, along = _beside_holes(x, opening, margin[0]), _beside_holes(y, opening, margin[1])
+    width, height, z = along[-1][1] - along[0][0], top - bottom, (top + bottom) / 2
+    middle = (along[-1][1] + along[0][0]) / 2
+    bars = [box((high - low, width, height), ((low + high) / 2, middle, z)) for low, high in across]
+    return bars + [box((opening, high - low, height), (at, (low + high) / 2, z)) for at in x for low, high in along]
+
+
+def _beside_holes(places: Array, opening: float, margin: float) -> list[tuple[float, float]]:
+    """(low, high) of what is before, between and after openings around some places along a line, m."""
+    edges = [places[0] - opening / 2 - margin, *(at + side * opening / 2 for at in places for side in (-1, 1))]
+    return list(zip(edges[::2], [*edges[1::2], places[-1] + opening / 2 + margin]))
+
+
+def moved(parts: Sequence[Part], T: Array) -> list[Part]:
+    """The parts of a group after a motion T (4, 4) of all of it."""
+    return [part._replace(T=T @ part.T) for part in parts]
+
+
 def collect(parts: Sequence[Part]) -> tuple[Array, Array, Array, Array]:
     """kind (P,) u1, size (P, 3) f8, T (P, 4, 4) f8 and role (P,) u1 of at least one part."""
     return (
@@ -106,6 +135,13 @@ def bounds(kind: Array, size: Array, T: Array) -> Array:
     extent = np.where((kind == BOX)[:, None], box_half, np.where((kind == CYLINDER)[:, None], disc_half, round_half))
     centre = T[:, :3, 3]
     return np.stack([centre - extent, centre + extent], axis=1)
+
+
+def centre_of_mass(kind: Array, size: Array, T: Array) -> Array:
+    """(3,) centre of mass of solids of one density, m; where they overlap counts twice."""
+    _refuse_meshes(kind)
+    volume = size.prod(axis=1) * np.array([1.0, np.pi / 4, np.pi / 6])[kind]
+    return np.asarray(volume @ T[:, :3, 3] / volume.sum())
 
 
 def signed_distance(points: Array, kind: Array, size: Array, T: Array) -> Array:

@@ -11,15 +11,18 @@ A demo whose container was seen in one split and whose object in another can be 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from itertools import islice
+from collections.abc import Iterator
+
+import numpy as np
 
 from dapdata.config import SplitConfig
+from dapdata.records import Array
 from dapdata.rng import stream
 
 SPLITS = ("train", "val", "test")
 UNUSED = "unused"
 BLOCK = 10  # demos: small, so that a handful of demos already has all three
+BUFFER = 100_000  # rows
 
 
 def wanted(config: SplitConfig, seed: int) -> Iterator[str]:
@@ -34,27 +37,47 @@ def wanted(config: SplitConfig, seed: int) -> Iterator[str]:
         block += 1
 
 
-def assign(demos: int, instances: Iterable[tuple[int, int, int]], config: SplitConfig, seed: int) -> dict[int, str]:
+def assign(demos: Array, containers: Array, objects: Array, config: SplitConfig, seed: int) -> Array:
     """The split of each demo.
 
     Args:
-        demos: Number of demos in the dataset.
-        instances: (demo, container instance, object instance) of those that came about, in demo order.
+        demos: (D,) indices of the demos that came about, ascending.
+        containers: (D,) their container instances.
+        objects: (D,) their object instances.
         config: The shares of val and test.
         seed: The recipe's seed.
+
+    Returns:
+        (D,) words.
     """
-    wishes = list(islice(wanted(config, seed), demos))
-    containers: dict[int, str] = {}
-    objects: dict[int, str] = {}
-    splits: dict[int, str] = {}
-    for demo, container, thing in instances:
-        known = {owner for owner in (containers.get(container), objects.get(thing)) if owner is not None}
-        if len(known) == 2:
-            splits[demo] = UNUSED
-            continue
-        splits[demo] = known.pop() if known else wishes[demo]
-        containers[container] = objects[thing] = splits[demo]
+    wishes, wish, wished = wanted(config, seed), "", -1
+    (owner_of_container, container), (owner_of_object, thing) = _numbered(containers), _numbered(objects)
+    splits = np.full(len(demos), UNUSED, dtype=object)
+    for row, (demo, c, o) in enumerate(_rows(demos, container, thing)):
+        while wished < demo:
+            wish, wished = next(wishes), wished + 1
+        one, other = owner_of_container[c], owner_of_object[o]
+        if not one or not other or one == other:
+            splits[row] = owner_of_container[c] = owner_of_object[o] = one or other or wish
     return splits
+
+
+def distinct(instances: Array) -> Array:
+    """The instances without repetition, ascending; np.unique hashes integers, which takes ten times as long for millions."""
+    ordered = np.sort(instances)
+    return ordered[np.concatenate([[True], np.diff(ordered) > 0])] if len(ordered) else ordered
+
+
+def _numbered(instances: Array) -> tuple[list[str], Array]:
+    """The owner of each instance, nobody ("") yet; and (D,) which instance is each demo's."""
+    known, number = np.unique(instances, return_inverse=True)
+    return [""] * len(known), number.astype(np.int32)
+
+
+def _rows(*columns: Array) -> Iterator[tuple[int, ...]]:
+    """The rows of integer columns; ten million Python integers at once would be a gigabyte."""
+    for start in range(0, len(columns[0]), BUFFER):
+        yield from zip(*(column[start : start + BUFFER].tolist() for column in columns))
 
 
 def _rounded(value: float) -> int:

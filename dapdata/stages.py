@@ -8,9 +8,11 @@ the engine and the paths are not in it, so a dataset grows and moves without bei
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
+from hashlib import sha256
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -18,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from dapdata import durable
+from dapdata.errors import UsageError
 from dapdata.records import Record, Rejected
 
 FORMAT = 1  # part of every key: another format makes every unit anew
@@ -58,6 +61,22 @@ def units(demos: int, shard_size: int) -> list[Unit]:
     return [Unit(i, first, min(first + shard_size, demos)) for i, first in enumerate(range(0, demos, shard_size))]
 
 
+def stripe(text: str, units: Sequence[Unit]) -> list[Unit]:
+    """Every N-th unit from the I-th on, for a text "I/N": the same ones whoever works on them, and with how many workers.
+
+    Raises:
+        UsageError: if the text is no such thing.
+    """
+    found = re.fullmatch(r"(\d+)/(\d+)", text)
+    index, count = map(int, found.groups()) if found else (0, 0)
+    if index >= count:
+        raise UsageError(
+            f"--units: got '{text}', expected I/N with I from 0 to N - 1, such as 0/8 to 7/8; in an array job I is the "
+            "number of the task, counted from 0"
+        )
+    return list(units[index::count])
+
+
 def specs(stages: Sequence[Stage], resolved: Mapping[str, Any]) -> dict[str, Spec]:
     """What each stage's results follow from under a resolved recipe, with the packages installed here."""
     return {
@@ -78,23 +97,31 @@ def _installed(package: str) -> str:
         return "not installed"
 
 
+class Keys:
+    """Keys of units: the sha256 of canonical JSON, of which all that units share is written once."""
+
+    def __init__(self, plan: Mapping[str, Spec], seed: int) -> None:
+        self._plan = plan
+        self._shared = {
+            name: durable.canonical(
+                {"format": FORMAT, "packages": spec["packages"], "sections": spec["sections"], "seed": seed, "stage": name}
+            )[1:-1]
+            for name, spec in plan.items()
+        }
+
+    def of(self, stage: str, unit: Unit) -> str:
+        """The key of a unit in a stage."""
+        spec = self._plan[stage]
+        upstream = durable.canonical({need: self.of(need, unit) for need in spec["needs"]})
+        demos, version = f"[{unit.start},{unit.stop}]".encode(), durable.canonical(spec["version"])
+        parts = (b'{"demos":', demos, b",", self._shared[stage], b',"upstream":', upstream, b',"version":', version, b"}")
+        return sha256(b"".join(parts)).hexdigest()
+
+
 def unit_keys(plan: Mapping[str, Spec], seed: int, unit: Unit) -> dict[str, str]:
-    """The key of a unit in each stage. The stages come in an order in which each follows what it needs."""
-    keys: dict[str, str] = {}
-    for name, spec in plan.items():
-        keys[name] = durable.digest(
-            {
-                "format": FORMAT,
-                "stage": name,
-                "version": spec["version"],
-                "sections": spec["sections"],
-                "packages": spec["packages"],
-                "seed": seed,
-                "demos": [unit.start, unit.stop],
-                "upstream": {need: keys[need] for need in spec["needs"]},
-            }
-        )
-    return keys
+    """The key of a unit in each stage."""
+    keys = Keys(plan, seed)
+    return {name: keys.of(name, unit) for name in plan}
 
 
 @dataclass(frozen=True)
@@ -106,18 +133,19 @@ class Layout:
     seed: int
     shard_size: int
     shard_stage: str
-    _keys: dict[Unit, dict[str, str]] = field(default_factory=dict, compare=False, repr=False)
 
     @cached_property
     def labelling(self) -> str:
         """Short digest of all that decides the shards, but for which demos there are."""
         return durable.digest([FORMAT, dict(self.plan), self.seed, self.shard_size])[:12]
 
+    @cached_property
+    def _keys(self) -> Keys:
+        return Keys(self.plan, self.seed)
+
     def key(self, stage: str, unit: Unit) -> str:
         """The key of a unit in a stage."""
-        if unit not in self._keys:
-            self._keys[unit] = unit_keys(self.plan, self.seed, unit)
-        return self._keys[unit][stage]
+        return self._keys.of(stage, unit)
 
     def path(self, stage: str, unit: Unit) -> str:
         """The folder of a unit, from the dataset's; a shard that isn't full says how many demos it is for."""

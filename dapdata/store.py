@@ -12,7 +12,8 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import Field, dataclass, field
 from hashlib import sha256
 from importlib.metadata import version
@@ -95,9 +96,21 @@ def demo_digest(sample: Sample) -> str:
     return total.hexdigest()
 
 
-def content_digest(digests: Sequence[str]) -> str:
+class ContentDigest:
     """sha256 over the demos' digests in demo order: the same whatever the workers, the shards and the codecs."""
-    return sha256("\n".join(digests).encode()).hexdigest()
+
+    def __init__(self) -> None:
+        self._total, self._edge = sha256(), ""
+
+    def add(self, digests: Iterable[str]) -> None:
+        """Takes the digests of the demos that come next."""
+        for digest in digests:
+            self._total.update(f"{self._edge}{digest}".encode())
+            self._edge = "\n"
+
+    def hexdigest(self) -> str:
+        """The digest of all so far."""
+        return self._total.hexdigest()
 
 
 def problems(sample: Sample) -> Iterator[str]:
@@ -285,6 +298,21 @@ def lender(folder: Path, record: Mapping[str, Any]) -> Lender:
 def is_committed(folder: Path) -> bool:
     """Whether there is a whole unit: committing is a rename, so its root is there or nothing is."""
     return (folder / "zarr.json").is_file()
+
+
+def committed(root: Path, paths: Iterable[str]) -> set[str]:
+    """Which of these units are there. The folders that hold units are listed, once each: no file is looked at.
+
+    Args:
+        root: The dataset's folder.
+        paths: Folders of units, from there.
+    """
+    wanted = set(paths)
+    found: set[str] = set()
+    for parent in {path.rpartition("/")[0] for path in wanted}:
+        with suppress(FileNotFoundError), os.scandir(root / parent) as entries:
+            found.update(f"{parent}/{entry.name}" for entry in entries if entry.is_dir())
+    return wanted & found
 
 
 def read_record(folder: Path) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from dapdata import solids
 from dapdata.config import CoordinateRange, DegreesRange, LengthRange, SceneConfig, key
 from dapdata.poses import pose, random_rotation, rotation_about
 from dapdata.records import GOAL_KINDS, SYMMETRIES, Rejected, Scene
-from dapdata.solids import Part
+from dapdata.solids import Part, Vector
 
 Array = NDArray[Any]
 
@@ -28,6 +28,7 @@ START_TRIES = 100  # draws of a start pose before the scene is given up
 START_MARGIN = 0.02  # m between the container's footprint and the object's bounding sphere
 MAX_PARTS = 2000  # in a scene; hundreds already take seconds a demo
 HOVER = 0.0005  # m: candidates are this far above what they stand on, and settle onto it
+FRONT, ABOVE = (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)  # container frame: where containers open
 
 
 class TabletopConfig(SceneConfig):
@@ -58,9 +59,11 @@ def expect_few(parts: float, names: str) -> None:
 class Candidate:
     """A place in the container where the object might stand."""
 
-    position: tuple[float, float, float]  # m, container frame, of the object's centre; its axes are the container's
+    position: tuple[float, float, float]  # m, container frame, of the object's centre
     kind: str  # one of records.GOAL_KINDS
     clearance: float  # m, total free play along the tightest horizontal direction
+    rotation: Array | None = None  # (3, 3) of the object's axes; None: they are the container's
+    approach: Vector | None = None  # (3,) unit vector out of the place, container frame; None: the container's opening
 
 
 def build_scene(
@@ -70,16 +73,21 @@ def build_scene(
     candidates: Sequence[Candidate],
     symmetry: str,
     rng: np.random.Generator,
+    *,
+    opening: Vector = FRONT,
+    axis: Vector = (0.0, 0.0, 1.0),
 ) -> Scene | Rejected:
-    """The scene of a container that opens along its +x, with container and object put on the table.
+    """The scene with container and object put on the table; the container's +x looks at the middle of it.
 
     Args:
         params: The task's parameters.
         parts: Container and clutter, container frame.
         object_parts: The object, in its own frame: origin at its bounding box's centre, z up at a goal.
         candidates: Every place where the object might stand; none makes the scene Rejected("no_free_slot").
-        symmetry: One of records.SYMMETRIES; an axis of revolution is z.
+        symmetry: One of records.SYMMETRIES.
         rng: Draws the poses.
+        opening: (3,) unit vector out of the container, container frame.
+        axis: (3,) axis of a revolution, object frame.
     """
     if not candidates:
         return Rejected("no_free_slot")
@@ -100,13 +108,14 @@ def build_scene(
         object_kind=object_kind,
         object_size=object_size,
         T_object_part=T_object_part,
-        T_container_goal=np.stack([pose(None, candidate.position) for candidate in candidates]),
+        T_container_goal=np.stack([pose(candidate.rotation, candidate.position) for candidate in candidates]),
         goal_kind=np.array([GOAL_KINDS.index(candidate.kind) for candidate in candidates], np.uint8),
         goal_clearance=np.array([candidate.clearance for candidate in candidates]),
-        opening=np.array([1.0, 0.0, 0.0]),
+        goal_approach=np.array([opening if c.approach is None else c.approach for c in candidates], np.float64),
+        opening=np.array(opening, np.float64),
         max_tilt=float(np.radians(params.max_tilt_deg)),
         symmetry_kind=SYMMETRIES.index(symmetry),
-        symmetry_axis=np.array([0.0, 0.0, 1.0]),
+        symmetry_axis=np.array(axis, np.float64),
         T_world_container=T_world_container,
         T_world_object_start=start,
         container_instance=solids.digest(kind, size, T),

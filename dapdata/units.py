@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import resource
+import socket
 import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -17,16 +18,16 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from dapdata import card, croissant, durable, manifest, remote, rng, split, store
 from dapdata.config import SplitConfig
-from dapdata.errors import CorruptionError, DapdataError, UsageError
-from dapdata.manifest import Manifest, Rejects, SplitEntry, StageEntry, UnitEntry
+from dapdata.errors import CorruptionError, DapdataError, EnvironmentProblem, UsageError
+from dapdata.manifest import Manifest, MissingEntry, Rejects, SplitEntry, StageEntry, UnitEntry
 from dapdata.records import Demo, Record, Rejected, read_record, to_sample
-from dapdata.stages import Layout, Spec, Stage, Unit
+from dapdata.stages import Layout, Spec, Stage, Unit, changes, specs
+from dapdata.tables import Index, insert_words, writer
 
 CALL = "dapdata.units:run_unit"
+ROWS = "rows.parquet"  # the index before the splits are known, while it is made
 COUNTED = {  # column of the index: array whose rows it counts
     "container_points": "container/points",
     "object_points": "object/points",
@@ -83,6 +84,7 @@ def _make(work: Work, root: Path) -> dict[str, Any]:
     table = import_module(work.table)
     stages: dict[str, Stage] = {stage.name: stage for stage in table.STAGES}
     layout = layout_of(root, table.STAGES, work.specs, work.recipe)
+    _check_versions(work, specs(table.STAGES, work.recipe))
     recipe, unit = table.parse(work.recipe), Unit(*work.unit)
     remote.pull(root, [layout.path(name, unit) for name in layout.plan])
     made: dict[str, Made] = {}
@@ -111,6 +113,16 @@ def _make(work: Work, root: Path) -> dict[str, Any]:
             }
         )
     return {"made": told}
+
+
+def _check_versions(work: Work, here: Mapping[str, Spec]) -> None:
+    """Refuses to make what is keyed by other versions than those that are installed where the unit is made."""
+    differences = [line for stage in work.stages for line in changes(work.specs[stage], here[stage])]
+    if differences:
+        raise EnvironmentProblem(
+            f"{socket.gethostname()}: not what the unit is made for ({'; '.join(sorted(set(differences)))}), expected the same "
+            "versions on every machine that works; install them there"
+        )
 
 
 # Running a stage -------------------------------------------------------------------------------------------
@@ -243,7 +255,7 @@ def _row(demo: int, sample: store.Sample, is_shard: bool) -> dict[str, Any]:
 
 def describe(sample: store.Sample) -> dict[str, int]:
     """Seed, instances and counts of one demo."""
-    meta = {name: int(sample[f"meta/{name}"]) for name in ("seed", "container_instance", "object_instance", "attempts")}
+    meta = {name: int(sample[f"meta/{name}"]) for name in ("seed", "container_instance", "object_instance", "attempts", "task")}
     counts = {name: len(sample[path]) for name, path in COUNTED.items()}
     return meta | counts | {"positives": int((sample["container_superpoints/affordance"] > 0).sum())}
 
@@ -252,9 +264,14 @@ def describe(sample: store.Sample) -> dict[str, int]:
 
 
 def publish(
-    layout: Layout, stages: Sequence[Stage], recipe: Mapping[str, Any], config: SplitConfig, units: Sequence[Unit]
+    layout: Layout,
+    stages: Sequence[Stage],
+    recipe: Mapping[str, Any],
+    config: SplitConfig,
+    units: Sequence[Unit],
+    missing: Sequence[MissingEntry] = (),
 ) -> Manifest:
-    """Writes manifest, index and card for what is there; the shards are named if all of them are.
+    """Writes manifest, index and card for what is there; a stage is named if all of its units are, but for the missing.
 
     Args:
         layout: Where units are.
@@ -262,57 +279,134 @@ def publish(
         recipe: Resolved.
         config: The recipe's split section.
         units: All units of the dataset.
+        missing: Those that failed, and that the dataset is to do without.
+
+    Returns:
+        The manifest as it is read again.
     """
-    whole = [stage for stage in stages if all(store.is_committed(layout.folder(stage.name, unit)) for unit in units)]
-    entries: dict[str, list[UnitEntry]] = {}
-    records: dict[str, list[dict[str, Any]]] = {}
-    for stage in whole:
-        pairs = [_entry(layout, stage, unit) for unit in units]
-        entries[stage.name], records[stage.name] = [pair[0] for pair in pairs], [pair[1] for pair in pairs]
-    shards = entries.get(layout.shard_stage, [])
-    rows = list(_index_rows(recipe, shards, records.get(layout.shard_stage, []), config))
-    now = Manifest(
-        format=manifest.FORMAT,
-        name=recipe["name"],
-        task=recipe["scene"]["task"],
-        demos=recipe["demos"],
-        content_sha256=_content(records, layout.shard_stage),
-        recipe=dict(recipe),
-        recipe_sha256=durable.digest(recipe),
-        shards=shards if rows else [],
-        splits=_splits(rows),
-        rejects=_rejects(records),
-        stages=_stage_entries(layout, entries),
-        files={},
-        created_by={"dapdata": _version()} | store.created_by(),
-    )
-    _write(layout.root, now, rows, _previews(layout.root, now))
+    there = {stage.name: _there(layout, stage.name, units) for stage in stages}
+    spared = {entry.demo_range for entry in missing}
+    absent = {name: {(unit.start, unit.stop) for unit in {*units} - {*found}} for name, found in there.items()}
+    whole = [stage for stage in stages if there[stage.name] and absent[stage.name] <= spared]
+    with durable.staged(layout.root, "tables") as folder:
+        content, rejects = _gather(layout, whole, recipe, there, folder)
+        index = _index(folder, config, recipe["seed"])
+        large = len(whole) * len(units) + 2 * (index.rows if index else 0) > manifest.LARGE
+        entries: dict[str, Sequence[UnitEntry]] = {
+            stage.name: manifest.Units(folder / manifest.UNITS, stage.name, len(there[stage.name])) for stage in whole
+        }
+        if not large:
+            entries = {name: list(found) for name, found in entries.items()}
+        facts = Manifest(
+            format=manifest.FORMAT,
+            name=recipe["name"],
+            task=recipe["scene"]["task"],
+            demos=recipe["demos"],
+            content_sha256=content,
+            recipe=dict(recipe),
+            recipe_sha256=durable.digest(recipe),
+            shards=[],
+            splits=_splits(index, large) if index else {},
+            rejects=rejects,
+            missing=list(missing),
+            stages={},
+            files={},
+            created_by={"dapdata": _version()} | store.created_by(),
+        )
+        shards = entries.get(layout.shard_stage, []) if index else []
+        now = facts.model_copy(update={"shards": shards, "stages": _stage_entries(layout, entries)})
+        tables = {manifest.UNITS: folder / manifest.UNITS} if large else {}
+        tables |= {manifest.INDEX: index.path} if index else {}
+        _write(layout.root, now, tables, _previews(layout.root, now))
     durable.remove_file(layout.root / manifest.PROGRESS)
-    return now
+    return manifest.read(layout.root)
 
 
-def _write(root: Path, now: Manifest, rows: Sequence[Mapping[str, Any]], previews: Mapping[str, bytes]) -> None:
-    """Publishes a manifest with the files that follow from it."""
-    index = {manifest.INDEX: manifest.index_bytes(rows)} if rows else {}
+def _there(layout: Layout, stage: str, units: Sequence[Unit]) -> list[Unit]:
+    """Those of the units that are there in a stage."""
+    paths = [layout.path(stage, unit) for unit in units]
+    found = store.committed(layout.root, paths)
+    return [unit for unit, path in zip(units, paths) if path in found]
+
+
+def _gather(
+    layout: Layout, whole: Sequence[Stage], recipe: Mapping[str, Any], there: Mapping[str, Sequence[Unit]], folder: Path
+) -> tuple[str, Rejects]:
+    """Writes the tables of what the units say of themselves; their content digest, and all rejects.
+
+    The digest is over the shards' demos; before there are shards, over the demos of each stage that is there.
+    """
+    shard_is_there = any(stage.is_shard for stage in whole)
+    content, rejects = store.ContentDigest(), {what: Counter[str]() for what in Rejects.model_fields}
+    with writer(folder / manifest.UNITS) as entries, writer(folder / ROWS) as rows:
+        for stage in whole:
+            for unit in there[stage.name]:
+                entry, record = _entry(layout, stage, unit)
+                entries.add([manifest.unit_row(stage.name, entry)])
+                for what, counts in record["rejects"].items():
+                    rejects[what].update(counts)
+                if stage.is_shard or not shard_is_there:
+                    content.add(row["sha256"] for row in record["rows"])
+                if stage.is_shard:
+                    rows.add([_index_row(recipe, entry.path, number, row) for number, row in enumerate(record["rows"])])
+            entries.end_group()
+    return content.hexdigest(), Rejects(**{what: dict(sorted(counts.items())) for what, counts in rejects.items()})
+
+
+def _index_row(recipe: Mapping[str, Any], shard: str, number: int, row: Mapping[str, Any]) -> dict[str, Any]:
+    """A row of the index, but for the split."""
+    names = [scene["task"] for scene in recipe["scene"].get("scenes", [recipe["scene"]])]
+    place = {"shard": shard, "row": number, "task": names[row["task"]]}
+    return {"demo": row["demo"], **place, **{k: v for k, v in row.items() if k not in ("demo", "task")}}
+
+
+def _index(folder: Path, config: SplitConfig, seed: int) -> Index | None:
+    """The index of the rows that were gathered, with the split of each; None if there are none."""
+    if not (folder / ROWS).is_file():
+        return None
+    rows = Index(folder / ROWS)
+    splits = split.assign(rows["demo"], rows["container_instance"], rows["object_instance"], config, seed)
+    insert_words(folder / ROWS, folder / manifest.INDEX, "split", splits, 1)
+    return Index(folder / manifest.INDEX)
+
+
+def _splits(index: Index, large: bool) -> dict[str, SplitEntry]:
+    """The splits with their instances, or with how many they are."""
+
+    def entry(name: str) -> SplitEntry:
+        mine = index["split"] == name
+        containers, objects = (split.distinct(index[f"{what}_instance"][mine]) for what in ("container", "object"))
+        return SplitEntry(
+            demos=int(mine.sum()),
+            container_instances=len(containers) if large else containers.tolist(),
+            object_instances=len(objects) if large else objects.tolist(),
+        )
+
+    unused = [split.UNUSED] if (index["split"] == split.UNUSED).any() else []
+    return {name: entry(name) for name in (*split.SPLITS, *unused)}
+
+
+def _write(root: Path, now: Manifest, tables: Mapping[str, Path], previews: Mapping[str, bytes]) -> None:
+    """Publishes a manifest with its tables and the files that follow from them."""
+    index = Index(tables[manifest.INDEX]) if manifest.INDEX in tables else None
     facts = now.model_copy(update={"shards": [], "stages": {}}).model_dump(mode="json")
     stages = {name: entry.spec for name, entry in now.stages.items() if entry.units}
-    columns = {name: np.array([row[name] for row in rows]) for name in (rows[0] if rows else ())}
-    about = {manifest.CARD: card.render(facts, stages, len(rows), columns, sorted(previews)).encode()}
-    if rows:
+    demos = index.rows if index else 0
+    about = {manifest.CARD: card.render(facts, stages, demos, index or {}, sorted(previews)).encode()}
+    if index:
         folders = sorted({shard.path.rpartition("/")[0] for shard in now.shards})
-        about[manifest.CROISSANT] = croissant.render(facts, folders, columns, index[manifest.INDEX])
-    manifest.publish(root, now, {**index, **previews, **about})
+        about[manifest.CROISSANT] = croissant.render(facts, folders, index)
+    manifest.publish(root, now, {**tables, **previews, **about})
 
 
 def attach(root: Path, pictures: Mapping[str, bytes]) -> None:
     """Adds pictures under preview/ to a labelled dataset; the caller holds its lock."""
     now = manifest.read(root)
-    index = manifest.read_index(root)
-    rows = [{name: column[i].item() for name, column in index.items()} for i in range(len(index["demo"]))]
-    _write(root, now, rows, _previews(root, now) | dict(pictures))
+    tables = {name: root / name for name in (manifest.INDEX, manifest.UNITS) if name in now.files}
+    _write(root, now, tables, _previews(root, now) | dict(pictures))
 
 
-def _stage_entries(layout: Layout, entries: Mapping[str, list[UnitEntry]]) -> dict[str, StageEntry]:
+def _stage_entries(layout: Layout, entries: Mapping[str, Sequence[UnitEntry]]) -> dict[str, StageEntry]:
     """What is there; of stages that are not, how they were last run, so that a plan can say what has changed."""
     try:
         old = manifest.read(layout.root).stages
@@ -321,7 +415,7 @@ def _stage_entries(layout: Layout, entries: Mapping[str, list[UnitEntry]]) -> di
     found = {}
     for name, spec in layout.plan.items():
         if name in entries:
-            found[name] = StageEntry(spec=spec, units=entries[name])
+            found[name] = StageEntry.model_construct(spec=spec, units=entries[name])
         elif name in old:
             found[name] = StageEntry(spec=old[name].spec, units=[])
     return found
@@ -342,47 +436,7 @@ def _entry(layout: Layout, stage: Stage, unit: Unit) -> tuple[UnitEntry, dict[st
         sha256=durable.hash_file(folder / "zarr.json"),
         bytes=sum(fact["bytes"] for fact in record["files"].values()) + (folder / "zarr.json").stat().st_size,
     )
-    return entry, {**record, "files": {}}
-
-
-def _content(records: Mapping[str, Sequence[Mapping[str, Any]]], shard_stage: str) -> str:
-    """Over the shards' demos; before there are shards, over the demos of each stage that is there."""
-    used = [shard_stage] if shard_stage in records else list(records)
-    return store.content_digest([row["sha256"] for name in used for record in records[name] for row in record["rows"]])
-
-
-def _index_rows(
-    recipe: Mapping[str, Any], shards: Sequence[UnitEntry], records: Sequence[Mapping[str, Any]], config: SplitConfig
-) -> Iterator[dict[str, Any]]:
-    """The rows of the index, in demo order."""
-    instances = ((r["demo"], r["container_instance"], r["object_instance"]) for record in records for r in record["rows"])
-    splits = split.assign(recipe["demos"], instances, config, recipe["seed"])
-    for shard, record in zip(shards, records):
-        for number, row in enumerate(record["rows"]):
-            place = {"split": splits[row["demo"]], "shard": shard.path, "row": number, "task": recipe["scene"]["task"]}
-            yield {"demo": row["demo"], **place, **{k: v for k, v in row.items() if k != "demo"}}
-
-
-def _splits(rows: Sequence[Mapping[str, Any]]) -> dict[str, SplitEntry]:
-    def entry(name: str) -> SplitEntry:
-        mine = [row for row in rows if row["split"] == name]
-        return SplitEntry(
-            demos=len(mine),
-            container_instances=sorted({row["container_instance"] for row in mine}),
-            object_instances=sorted({row["object_instance"] for row in mine}),
-        )
-
-    unused = [split.UNUSED] if any(row["split"] == split.UNUSED for row in rows) else []
-    return {name: entry(name) for name in (*split.SPLITS, *unused)} if rows else {}
-
-
-def _rejects(records: Mapping[str, Sequence[Mapping[str, Any]]]) -> Rejects:
-    total: dict[str, Counter[str]] = {"attempts": Counter(), "demos": Counter(), "goals": Counter()}
-    for units in records.values():
-        for record in units:
-            for what, counts in record["rejects"].items():
-                total[what].update(counts)
-    return Rejects(**{what: dict(sorted(counts.items())) for what, counts in total.items()})
+    return entry, record
 
 
 def _previews(root: Path, now: Manifest) -> dict[str, bytes]:

@@ -1,236 +1,238 @@
-"""One HTML file about a dataset: facts, a 3-D view, a contact sheet, statistics. Nothing is loaded from a network.
+"""The 3-D view of demos in a page: clouds, goals, correspondences, true parts, cameras, each to be switched on and off.
 
-The page itself is `viewer.html`; this file fills it. Points travel as 16-bit steps within their box (steps of a
-few hundredths of a millimetre), normals and scores as 8-bit numbers: about 20 bytes a point.
+What is in a view is decided here, as layers of three kinds; `viewer.js` makes plotly's traces of them. Clouds travel as
+16-bit steps within their box (of a few hundredths of a millimetre), normals and colours as 8-bit numbers: 15 bytes a point,
+20 in base64. A point becomes a small hexagon that lies in its tangent plane, so that surfaces close and catch light.
+Solids travel once and are repeated by the page at each of their poses.
 """
 
 from __future__ import annotations
 
-import base64
-import json
-from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from html import escape
 from pathlib import Path
-from string import Template
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dapdata import records
-from dapdata.draw import to_light
-from dapdata.manifest import Manifest
+from dapdata import page, records
+from dapdata.draw import POINT_RADIUS, Triangles, to_light
 from dapdata.pictures import (
+    CLUTTER,
     DEMONSTRATED,
     DIVERGING,
     REJECTED,
     VALID,
+    WOOD,
+    Sample,
     Shown,
     front_view,
     height_colors,
     is_demonstrated,
+    solids,
     superpoint_colors,
     title,
 )
+from dapdata.poses import inverse, transform
 
 Array = NDArray[Any]
+Layer = dict[str, Any]
 
-MAX_POINTS = 40_000  # per demo in the view; more are thinned out evenly
-BARS = 24  # of a histogram
-BAR_COLOR = "#3d7f9b"
-INKS = {"valid": VALID, "demonstrated": DEMONSTRATED, **REJECTED}
+MAX_POINTS = 40_000  # of a cloud
+FRUSTUM = 0.06  # m, length of a camera as drawn
+STEPS = 256  # of a scale of colours
+SECTIONS = 32  # sides of a cylinder
+GOALS = {"demonstrated goal": (DEMONSTRATED, 0.7), "other valid goals": (VALID, 0.6)}
+PLAIN = np.full((2, 3), 0.74)
+CAMERA = (0.45, 0.45, 0.75)
+CORRESPONDENCE = (0.55, 0.35, 0.75)
 
 
-def page(manifest: Manifest, shown: Sequence[Shown], others: Sequence[Shown], sheet: bytes) -> str:
-    """The HTML of a dataset's page.
+def widget(views: Sequence[Mapping[str, Any]], colour: str = "height") -> str:
+    """The HTML of a 3-D view with a choice of demos, each from `view`; `colour` is that of the points at first."""
+    options = "".join(f'<option value="{v["demo"]}">{escape(v["name"])}</option>' for v in views)
+    return f"""<div class="view">
+<div class="stage"><div id="stage"></div><div class="buttons">
+<button type="button" id="front">front</button><button type="button" id="above">above</button>
+<button type="button" id="nearer" aria-label="nearer">+</button>
+<button type="button" id="further" aria-label="further">−</button>
+</div></div>
+<form onsubmit="return false">
+<fieldset><legend>Demo</legend><select id="demo" aria-label="demo">{options}</select><p class="soft" id="about"></p></fieldset>
+<fieldset id="colours"><legend>Colour of the points</legend></fieldset>
+<fieldset id="layers"><legend>Shown</legend></fieldset>
+</form></div>
+{page.data({"views": views, "colours": list(_colours()), "colour": colour}, "views")}
+{page.script(Path(__file__).with_name("viewer.js"))}"""
+
+
+def _colours() -> Iterator[dict[str, Any]]:
+    """The ways to colour points: name, title, scale from 0 to 1 and the words at its ends."""
+
+    def described(name: str, title: str, colors: Array, ends: tuple[str, str]) -> dict[str, Any]:
+        at = np.linspace(0, 1, len(colors)).round(4).tolist()
+        return {"name": name, "title": title, "scale": [[x, page.rgb(c)] for x, c in zip(at, colors)], "ends": ends}
+
+    yield described("height", "height (raw cloud)", height_colors(np.linspace(0, 1, 9), 1), ("0 m", ""))
+    yield described("superpoint", "superpoint", superpoint_colors(STEPS), ("a colour each", ""))
+    yield described("affordance", "affordance", DIVERGING, ("−1 keep away", "place here +1"))
+    yield described("plain", "plain", PLAIN, ("", ""))
+    yield described("camera", "camera that saw it", superpoint_colors(STEPS)[:12], ("a colour each", ""))
+
+
+def view(
+    shown: Shown,
+    *more: Layer,
+    note: str = "",
+    goals: Mapping[str, tuple[Sequence[float], float]] = GOALS,
+    most: int = MAX_POINTS,
+) -> dict[str, Any]:
+    """One demo for `widget`, ready for JSON.
 
     Args:
-        manifest: The dataset's.
-        shown: Demos for the 3-D view.
-        others: Demos for the statistics.
-        sheet: A contact sheet, PNG.
+        shown: The demo.
+        more: Further layers, such as `poses_layer(...)`.
+        note: Text about the demo; default: its counts.
+        goals: Name, colour and opacity of the demonstrated goal and of the other ones; of all, if it is one.
+        most: Points of a cloud that are kept; of more, so many are kept that are spread evenly.
     """
-    template = Template(Path(__file__).with_name("viewer.html").read_text(encoding="utf-8"))
-    splits = Counter(s.split for s in others)
-    facts = {"demos": manifest.demos - sum(manifest.rejects.demos.values())} | _medians(others)
-    return template.substitute(
-        title=escape(manifest.name),
-        subtitle=escape(f"task {manifest.task}: placement demonstrations made with dapdata; metres, world frame, z up"),
-        facts="".join(f"<div><dt>{escape(key)}</dt><dd>{value:,}</dd></div>" for key, value in facts.items()),
-        sheet=base64.b64encode(sheet).decode(),
-        sheet_alt=escape(f"contact sheet of {manifest.name}: one row per demo"),
-        statistics_note=escape(
-            f"Over {len(others)} demos, spread evenly ({', '.join(f'{n} {s}' for s, n in splits.items())}); "
-            "rejects over the whole dataset."
-        ),
-        plots=plots([s.sample for s in others], manifest),
-        digest=manifest.content_sha256,
-        recipe=escape(json.dumps(manifest.recipe, indent=1)),
-        data=json.dumps(view_data(shown)).replace("<", "\\u003c"),
-    )
-
-
-def _medians(shown: Sequence[Shown]) -> dict[str, int]:
-    def median(path: str) -> int:
-        return int(np.median([len(s.sample[path]) for s in shown]))
-
-    return {
-        "valid goals, median": median("goals/kind"),
-        "container points, median": median("container/points"),
-        "object points, median": median("object/points"),
-        "superpoints, median": median("container_superpoints/size"),
-    }
-
-
-def view_data(shown: Sequence[Shown]) -> dict[str, Any]:
-    """What the 3-D view needs, ready for JSON; colours from 0 to 255."""
-    return {
-        "demos": [_demo_data(s) for s in shown],
-        "height": _rgb(height_colors(np.linspace(0, 1, 9), 1)),
-        "affordance": _rgb(DIVERGING),
-        "palette": _rgb(superpoint_colors(512)),
-        "ink": {name: f"rgb({','.join(map(str, _rgb(np.array(c))))})" for name, c in INKS.items()},
-    }
-
-
-def _rgb(colors: Array) -> Any:
-    return np.round(np.asarray(colors) * 255).astype(int).tolist()
-
-
-def _demo_data(shown: Shown) -> dict[str, Any]:
     sample = shown.sample
-    points = sample["container/points"]
-    low, high = points.min(axis=0), points.max(axis=0)
-    out = sample["pose/T_world_container"][:3, :3] @ sample["scene/opening"]
     name, counts = title(shown)
-    T_world_container = sample["pose/T_world_container"]
+    points = sample["container/points"].astype(float)
+    low, high = points.min(axis=0), points.max(axis=0)
+    front = front_view(sample, 64, 48)
     return {
+        "demo": int(sample["meta/demo"]),
         "name": name,
-        "counts": counts,
-        "top": float(high[2]),
+        "note": note or counts,
+        "top": f"{max(high[2], 1e-3):.2f} m",
         "center": ((low + high) / 2).tolist(),
         "extent": float(np.linalg.norm(high - low)),
-        "light": to_light(front_view(sample, 64, 48)).tolist(),
-        "yaw": float(np.arctan2(out[1], out[0])) + 0.4,
-        "container": _cloud_data(sample, "container"),
-        "object": _cloud_data(sample, "object"),
-        "T_world_container": T_world_container.ravel().tolist(),
-        "parts": _parts(sample["scene/kind"], sample["scene/size"], sample["scene/T_container_part"]),
-        "object_parts": _parts(sample["object_parts/kind"], sample["object_parts/size"], sample["object_parts/T_object_part"]),
-        "goals": [
-            {"T": T.ravel().tolist(), "demonstrated": bool(d)}
-            for T, d in zip(sample["goals/T_world_object"], is_demonstrated(sample))
-        ],
-        "rejected": [
-            {"T": T.ravel().tolist(), "reason": records.REJECT_REASONS[reason]}
-            for T, reason in zip(sample["rejected_goals/T_world_object"], sample["rejected_goals/reason"])
-        ],
+        "reach": float(np.abs(_everywhere(sample) - (low + high) / 2).max()) + 0.1,
+        "eye": (-front.T_world_camera[:3, 2]).tolist(),
+        "light": to_light(front).tolist(),
+        "clouds": {body: _cloud(sample, body, float(high[2]), most) for body in ("container", "object")},
+        "solids": {name: _solid(triangles) for name, triangles in solids(sample, SECTIONS).items()},
+        "layers": [*more, *layers(sample, goals)],
     }
 
 
-def _parts(kind: Array, size: Array, T: Array) -> list[dict[str, Any]]:
-    return [{"kind": int(k), "size": s.tolist(), "T": t.ravel().tolist()} for k, s, t in zip(kind, size, T)]
+def layers(sample: Sample, goals: Mapping[str, tuple[Sequence[float], float]] = GOALS) -> Iterator[Layer]:
+    """What a demo has to show: its clouds, goals, rejected candidates, correspondences, true parts and cameras."""
+    T_object_start = inverse(sample["pose/T_world_object_start"])
+    yield {"kind": "cloud", "name": "container cloud", "cloud": "container", "on": True}
+    yield {"kind": "cloud", "name": "object cloud, start pose", "cloud": "object", "on": True}
+    moved = (sample["pose/T_world_object_goal"] @ T_object_start).ravel().tolist()
+    yield {"kind": "cloud", "name": "object cloud, demonstrated", "cloud": "object", "on": False, "T": moved}
+    demonstrated = is_demonstrated(sample) if len(goals) == 2 else np.ones(len(sample["goals/kind"]), bool)
+    kinds = [records.GOAL_KINDS[kind] for kind in sample["goals/kind"]]
+    says = [f"goal {g}: {k}, {1000 * c:.0f} mm free play" for g, (k, c) in enumerate(zip(kinds, sample["goals/clearance"]))]
+    for (name, (color, opacity)), mine in zip(goals.items(), (demonstrated, ~demonstrated)):
+        if mine.any():
+            T = sample["goals/T_world_object"][mine]
+            yield poses_layer(name, color, T, [says[g] for g in np.flatnonzero(mine)], opacity=opacity)
+    for code, reason in enumerate(records.REJECT_REASONS):
+        T = sample["rejected_goals/T_world_object"][sample["rejected_goals/reason"] == code]
+        if len(T):
+            words = f"rejected: {reason.replace('_', ' ')}"
+            yield poses_layer(words, REJECTED[reason], T, [words] * len(T), on=False, opacity=0.35)
+    yield _correspondences(sample)
+    for role, color in zip(records.ROLES, (WOOD, CLUTTER)):
+        if (sample["scene/role"] == records.ROLES.index(role)).any():
+            T = sample["pose/T_world_container"][None]
+            yield poses_layer(f"true parts: {role}", color, T, [role], on=False, opacity=1.0, solid=role)
+    yield _cameras(sample)
 
 
-def _cloud_data(sample: Mapping[str, Array], body: str) -> dict[str, Any]:
+def poses_layer(
+    name: str,
+    color: Sequence[float],
+    T_world_object: Array,
+    says: Sequence[str],
+    *,
+    on: bool = True,
+    opacity: float = 0.6,
+    solid: str = "object",
+) -> Layer:
+    """A layer that shows a solid at (G, 4, 4) poses, with a text for each."""
+    T = np.round(T_world_object[:, :3], 5).reshape(-1, 12).tolist()
+    return {
+        "kind": "solid",
+        "name": name,
+        "color": page.rgb(color),
+        "poses": T,
+        "says": list(says),
+        "on": on,
+        "opacity": opacity,
+        "solid": solid,
+    }
+
+
+def lines_layer(name: str, color: Sequence[float], ends: Array, says: Sequence[str]) -> Layer:
+    """A layer of (L, 2, 3) lines in the world, m, with a text for each."""
+    return {
+        "kind": "lines",
+        "name": name,
+        "color": page.rgb(color),
+        "ends": page.pack(ends, "<f4"),
+        "says": list(says),
+        "on": False,
+    }
+
+
+def _correspondences(sample: Sample) -> Layer:
+    """Lines between superpoints, the object's at its start pose."""
+    a, b = sample["correspondence/object_superpoint"], sample["correspondence/container_superpoint"]
+    ends = np.stack([sample["object_superpoints/points"][a], sample["container_superpoints/points"][b]], axis=1)
+    says = [
+        f"superpoints {i} and {j}: {1000 * d:.0f} mm apart at the goal"
+        for i, j, d in zip(a, b, sample["correspondence/distance"])
+    ]
+    return lines_layer("correspondences", CORRESPONDENCE, ends, says)
+
+
+def _cameras(sample: Sample) -> Layer:
+    """Each camera as a small pyramid: its centre and the corners of its picture."""
+    ends, says = [], []
+    for i, (K, T) in enumerate(zip(sample["camera/K"], sample["camera/T_world_camera"])):
+        half = K[:2, 2] / np.diag(K)[:2]
+        corners = transform(T, FRUSTUM * np.c_[half * [[-1, -1], [1, -1], [1, 1], [-1, 1]], np.ones(4)])
+        centre = np.repeat(T[None, :3, 3], 4, axis=0)
+        ends += [np.stack([centre, corners], axis=1), np.stack([corners, np.roll(corners, 1, axis=0)], axis=1)]
+        says += [f"camera {i}"] * 8
+    return lines_layer("cameras", CAMERA, np.concatenate([np.zeros((0, 2, 3)), *ends]), says)
+
+
+def _everywhere(sample: Sample) -> Array:
+    """(N, 3) points that span all that a view may show."""
+    poses = [sample["goals/T_world_object"], sample["rejected_goals/T_world_object"], sample["camera/T_world_camera"]]
+    return np.concatenate([sample["container/points"], sample["object/points"], *(T[:, :3, 3] for T in poses)]).astype(float)
+
+
+def _cloud(sample: Sample, body: str, top: float, most: int) -> dict[str, Any]:
     points = sample[f"{body}/points"].astype(float)
-    keep = np.unique(np.linspace(0, len(points) - 1, min(len(points), MAX_POINTS)).astype(int))
+    keep = np.unique(np.linspace(0, len(points) - 1, min(len(points), most)).astype(int))
     low = points.min(axis=0)
     step = np.maximum(np.ptp(points, axis=0), 1e-6) / 65535
-    data = {
-        "low": low.tolist(),
-        "step": step.tolist(),
-        "points": _pack((points[keep] - low) / step, "<u2"),
-        "normals": _pack(sample[f"{body}/normals"][keep] * 127, "i1"),
-        "superpoint": _pack(sample[f"{body}/superpoint"][keep], "<u2"),
+    superpoint = sample[f"{body}/superpoint"][keep]
+    values = {
+        "height": np.clip(points[keep, 2] / max(top, 1e-3), 0, 1) * (STEPS - 1),
+        "superpoint": superpoint % STEPS,
+        "camera": sample[f"{body}/view"][keep] % 12 * (STEPS - 1) / 11,
     }
     if body == "container":
-        data["affordance"] = _pack(sample["container_superpoints/affordance"] * 127, "i1")
-    return data
+        values["affordance"] = (sample["container_superpoints/affordance"][superpoint] + 1) / 2 * (STEPS - 1)
+    return {
+        "low": low.tolist(),
+        "step": step.tolist(),
+        "points": page.pack((points[keep] - low) / step, "<u2"),
+        "normals": page.pack(sample[f"{body}/normals"][keep] * 127, "i1"),
+        "values": {name: page.pack(value, "u1") for name, value in values.items()},
+        "radius": POINT_RADIUS * (1.0 if body == "container" else 0.6),  # the object's cloud is finer
+    }
 
 
-def _pack(values: Array, dtype: str) -> str:
-    return base64.b64encode(np.ascontiguousarray(np.round(values), dtype=dtype).tobytes()).decode()
-
-
-def plots(samples: Sequence[Mapping[str, Array]], manifest: Manifest) -> str:
-    """Figures (SVG in HTML) of what some demos of a dataset, and its manifest, hold."""
-
-    def lengths(path: str) -> Array:
-        return np.array([len(sample[path]) for sample in samples])
-
-    def counted(path: str, names: tuple[str, ...]) -> dict[str, int]:
-        codes = Counter(int(code) for sample in samples for code in np.atleast_1d(sample[path]))
-        return {names[code]: n for code, n in codes.most_common()}
-
-    near = np.array([float((sample["container_superpoints/affordance"] > 0).mean()) for sample in samples])
-    clearance = np.concatenate([sample["goals/clearance"] for sample in samples]) * 1000
-    figures = [
-        histogram("Valid goals", "per demo", lengths("goals/kind")),
-        histogram("Container points", "per demo", lengths("container/points")),
-        histogram("Object points", "per demo", lengths("object/points")),
-        histogram("Container superpoints", "per demo", lengths("container_superpoints/size")),
-        histogram("Parts", "of container and clutter, per demo", lengths("scene/kind")),
-        histogram("Free play at the goal", "mm, tightest horizontal direction", clearance),
-        histogram("Superpoints with affordance above 0", "%, per demo", near * 100),
-        histogram("Scenes drawn", "per accepted demo", np.array([int(sample["meta/attempts"]) for sample in samples])),
-        bars("What goals rest on", "valid goals", counted("goals/kind", records.GOAL_KINDS)),
-        bars("Rejected candidate goals", "by reason", manifest.rejects.goals),
-        bars("Rejected scenes", "by reason; another was drawn", manifest.rejects.attempts),
-        bars("Missing demos", "by reason", manifest.rejects.demos),
-    ]
-    return "".join(figures)
-
-
-def histogram(name: str, unit: str, values: Array) -> str:
-    """A histogram as an SVG figure; whole numbers with a small range get a bar each."""
-    if not len(values):
-        return bars(name, unit, {})
-    low, high = float(values.min()), float(values.max())
-    whole = bool(np.all(values == np.round(values)))
-    if whole and high - low < BARS:
-        edges = np.arange(low - 0.5, high + 1)
-    else:
-        edges = np.linspace(low, high if high > low else low + 1, BARS + 1)
-    counts, _ = np.histogram(values, edges)
-    width, height, tall = 280, 118, counts.max()
-    step = (width - 8) / len(counts)
-    shapes = "".join(
-        f'<rect x="{4 + i * step:.1f}" y="{98 - 86 * n / tall:.1f}" width="{max(step - 1.5, 0.5):.1f}" rx="1" '
-        f'height="{86 * n / tall:.1f}" fill="{BAR_COLOR}"><title>{edges[i]:.4g} to {edges[i + 1]:.4g}: {n}</title></rect>'
-        for i, n in enumerate(counts)
-        if n
-    )
-    ends = zip((4, width / 2, width - 4), ("start", "middle", "end"), (low, float(np.median(values)), high))
-    labels = "".join(
-        f'<text x="{x}" y="113" text-anchor="{anchor}">{"median " if anchor == "middle" else ""}{_number(value)}</text>'
-        for x, anchor, value in ends
-    )
-    return _figure(name, unit, width, height, f'<path d="M4 98.5H{width - 4}" stroke="#c9ced6"/>{shapes}{labels}')
-
-
-def _number(value: float) -> str:
-    """A value with thousands separated and no more decimals than tell it apart."""
-    return f"{value:,.0f}" if abs(value) >= 100 or value == round(value) else f"{value:.3g}"
-
-
-def bars(name: str, unit: str, counts: Mapping[str, int]) -> str:
-    """Horizontal bars with their counts as an SVG figure."""
-    if not counts:
-        return _figure(name, unit, 280, 40, '<text x="4" y="20">none</text>')
-    longest = max(counts.values())
-    rows = [
-        f'<text x="4" y="{14 + 20 * i}">{escape(key.replace("_", " "))}</text>'
-        f'<rect x="120" y="{5 + 20 * i}" width="{max(115 * n / longest, 1):.1f}" height="12" rx="1" fill="{BAR_COLOR}"/>'
-        f'<text x="{124 + 115 * n / longest:.1f}" y="{15 + 20 * i}">{n:,}</text>'
-        for i, (key, n) in enumerate(counts.items())
-    ]
-    return _figure(name, unit, 280, 20 * len(counts) + 8, "".join(rows))
-
-
-def _figure(name: str, unit: str, width: int, height: int, shapes: str) -> str:
-    return (
-        f"<figure><figcaption>{escape(name)} <span>{escape(unit)}</span></figcaption>"
-        f'<svg viewBox="0 0 {width} {height}" role="img" aria-label="{escape(name)}">{shapes}</svg></figure>'
-    )
+def _solid(triangles: Triangles) -> dict[str, str]:
+    small = len(triangles.vertices) <= 65536
+    return {"vertices": page.pack(triangles.vertices, "<f4"), "faces": page.pack(triangles.faces, "<u2" if small else "<u4")}

@@ -30,6 +30,7 @@ reader never sees half of a dataset. Its fields are in [`schemas/manifest.schema
 |---|---|
 | `manifest.json` | format, `content_sha256`, resolved recipe, shards, splits with their instances, rejects by reason, stages |
 | `index.parquet` | one row per demo: split, shard, row, instances, counts, rejects |
+| `units.parquet` | large datasets only: one row per unit, see below |
 | `README.md`, `preview/` | dataset card and pictures |
 | `croissant.json` | the same for machines: files, columns of the index, arrays of a shard (Croissant, JSON-LD) |
 | `shards/<labelling>/00000.zarr` | the product: self-contained groups, ready to train on |
@@ -37,6 +38,12 @@ reader never sees half of a dataset. Its fields are in [`schemas/manifest.schema
 
 `content_sha256` is a digest over the decoded arrays of all demos in demo order: it does not depend on the number of
 workers, the order of work, interruptions or codecs.
+
+A manifest has `format: 1`. With more than 100 000 units and instances together (two instances are counted for each demo)
+it has `format: 2`: `shards` still lists `path`, `demos` and `sha256` of each shard, but all else of units (key, demo
+range, bytes; those of the cached stages) stands in `units.parquet`, which the manifest names by its sha256, and
+of the instances of a split it tells only how many there are, since `index.parquet` has those of each demo. So ten million
+demos open in a second ([scale.md](scale.md)). Both formats are read; shards are the same in both.
 
 ## A shard
 
@@ -140,8 +147,8 @@ def _key_table(root: Any, paths: Any, skip: int) -> str:
 
 
 def _default(root: Any, path: Any) -> Any:
-    """The default of a key: that of the outermost section which states one."""
-    for n in range(1, len(path) + 1):
+    """The default of a key: its own, or that of the innermost section which states one."""
+    for n in range(len(path), 0, -1):
         value = keys.at(root, path[:n]).get("default")
         if value is not None:
             for part in path[n:]:

@@ -45,6 +45,7 @@ def make_demo(parts, object_parts, T_world_container, T_world_object_start, T_wo
         goals=T_world_object_goal[None],
         goal_kind=np.zeros(1, np.uint8),
         goal_clearance=np.zeros(1),
+        goal_approach=np.array([[1.0, 0, 0]]),
         rejected_goals=np.zeros((0, 4, 4)),
         rejected_reason=np.zeros(0, np.uint8),
         symmetry_kind=np.array(0, np.uint8),
@@ -63,6 +64,7 @@ def make_demo(parts, object_parts, T_world_container, T_world_object_start, T_wo
         container_instance=np.array(0),
         object_instance=np.array(0),
         attempts=np.array(0),
+        task=np.array(0),
     )
 
 

@@ -91,7 +91,7 @@ def test_the_card_counts_what_the_index_counts(tiny: Path) -> None:
 
 
 def test_a_leak_between_splits_shows_in_the_card(tiny: Path) -> None:
-    index = manifest.read_index(tiny)
+    index = {name: column.copy() for name, column in manifest.read_index(tiny).items()}
     train, test = (np.flatnonzero(index["split"] == name)[0] for name in ("train", "test"))
     index["object_instance"][test] = index["object_instance"][train]
     text = card.render(manifest.read(tiny).model_dump(mode="json"), {}, 5, index, [])

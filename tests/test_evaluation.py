@@ -11,13 +11,16 @@ import pytest
 
 from dapdata import loading, metrics, predictions
 from dapdata import rng as rngs
+from dapdata.config import TrainConfig
 from dapdata.errors import CheckpointError, CorruptionError, UsageError
-from dapdata.poses import tilt
+from dapdata.poses import inverse, tilt
 from dapdata.records import Placement
 from dapdata.report import Report
 from daptrain import baselines
+from daptrain.baselines import heuristic
 from daptrain.baselines.random import interior
 from daptrain.evaluation import evaluate
+from daptrain.fit import fit_object
 
 
 def quiet(line: str) -> None:
@@ -34,7 +37,7 @@ class Links(HTMLParser):
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         self.loads += [value or "" for name, value in attrs if name in ("src", "href")]
-        if tag not in ("img", "meta", "path", "rect", "circle"):
+        if tag not in ("img", "meta", "link", "input", "br"):
             self.open.append(tag)
 
     def handle_endtag(self, tag: str) -> None:
@@ -50,7 +53,7 @@ def test_baselines_give_k_finite_upright_poses_and_repeat_themselves(tiny: Path,
     assert [p.status for p in first] == ["ok"] * 5
     for one, other in zip(first, again):
         assert np.isfinite(one.T_world_object).all()
-        assert np.rad2deg(tilt(one.T_world_object, "revolution")) < 5
+        assert np.rad2deg(tilt(one.T_world_object, "revolution", np.array([0.0, 0, 1]))) < 5
         np.testing.assert_array_equal(one.T_world_object, other.T_world_object)
 
 
@@ -64,12 +67,34 @@ def test_random_stays_in_the_container_and_the_oracle_starts_with_the_demonstrat
     np.testing.assert_allclose(oracle[0].T_world_object, sample["pose/T_world_object_goal"])
 
 
+def test_the_box_of_a_container_that_opens_upwards_reaches_half_an_object_higher(tiny: Path) -> None:
+    sample = loading.open(tiny)[0]
+    low, high = interior(sample)
+    upwards = dict(sample) | {"scene/opening": np.array([0.0, 0, 1])}
+    np.testing.assert_allclose(interior(upwards)[0], low)
+    np.testing.assert_allclose(interior(upwards)[1] - high, [0, 0, sample["object_parts/size"][0, 2] / 2])
+
+
 def test_the_heuristic_gives_a_status_when_nothing_can_be_fitted(tiny: Path) -> None:
     sample = dict(loading.open(tiny)[0])
     sample["object/points"], sample["object/normals"] = sample["object/points"][:3], sample["object/normals"][:3]
     (only,) = baselines.load("heuristic")(sample, 4, rngs.stream(0, "x", 0))
     assert only.status == "too_few_points"
     assert np.isnan(only.T_world_object).all()
+
+
+def test_the_heuristic_refines_and_ranks_as_the_recipe_says(tiny: Path) -> None:
+    sample = loading.open(tiny)[0]
+    fit = fit_object(sample["object/points"], sample["object/normals"])
+    drawn = heuristic.propose(sample, fit, 6, rngs.stream(0, "x", 0))
+    T_box_object = inverse(fit.T_world_box) @ sample["pose/T_world_object_start"]
+    plain = baselines.load("heuristic", TrainConfig(refine=[], ranking=[]))(sample, 6, rngs.stream(0, "x", 0))
+    np.testing.assert_allclose([p.T_world_object for p in plain], drawn @ T_box_object, atol=1e-12)
+    assert len({p.score for p in plain}) == 1
+    counted = baselines.load("heuristic", TrainConfig(refine=[], ranking=["collision"]))(sample, 6, rngs.stream(0, "x", 0))
+    assert all(p.score == -round(-p.score) for p in counted), "a number of points"
+    usual = baselines.load("heuristic")(sample, 6, rngs.stream(0, "x", 0))
+    assert not np.allclose([p.T_world_object for p in usual], drawn @ T_box_object)
 
 
 def test_eval_leaves_predictions_a_report_and_a_page_that_needs_no_network(tiny: Path, tmp_path: Path) -> None:
@@ -88,9 +113,10 @@ def test_eval_leaves_predictions_a_report_and_a_page_that_needs_no_network(tiny:
     page = (tmp_path / "out/report.html").read_text()
     links = Links()
     links.feed(page)
-    assert all(link.startswith("data:image/") for link in links.loads)
+    assert all(link.startswith(("data:", "#")) for link in links.loads)
     failures = sum(not row.success for row in made.scenes)
-    assert len(links.loads) == 2 * (failures + min(6, len(made.scenes) - failures))
+    pictures = [link for link in links.loads if link.startswith("data:image/jpeg")]
+    assert len(pictures) == 2 * (failures + min(6, len(made.scenes) - failures))
     assert not links.open
 
 

@@ -16,7 +16,7 @@ import pytest
 from conftest import make_toy
 from toy_stages import toy_recipe
 
-from dapdata import durable, health, manifest, pipeline
+from dapdata import durable, health, manifest, pipeline, tables
 from dapdata.errors import CorruptionError, LockedError, QuarantineError
 
 TABLE = "toy_stages"
@@ -93,13 +93,15 @@ def test_a_missing_unit_is_found(toy_copy: Path) -> None:
     assert any(found.shards[0].path in problem and "missing" in problem for problem in health.verify(toy_copy).problems)
 
 
-def test_a_split_that_leaks_is_found(toy_copy: Path) -> None:
+def test_a_split_that_leaks_is_found(toy_copy: Path, tmp_path: Path) -> None:
     found = manifest.read(toy_copy)
     index = manifest.read_index(toy_copy)
-    rows = [{name: column[i].item() for name, column in index.items()} for i in range(len(index["demo"]))]
+    rows = [dict(zip(index, values)) for values in index.stream(list(index))]
     rows[1]["container_instance"], rows[1]["split"] = rows[0]["container_instance"], "test"
     rows[0]["split"] = "train"
-    manifest.publish(toy_copy, found, {"index.parquet": manifest.index_bytes(rows), "README.md": b""})
+    with tables.writer(tmp_path / "index.parquet") as leaking:
+        leaking.add(rows)
+    manifest.publish(toy_copy, found, {"index.parquet": tmp_path / "index.parquet", "README.md": b""})
     assert any("is in test and train" in problem for problem in health.verify(toy_copy).problems)
 
 

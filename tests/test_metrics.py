@@ -195,6 +195,7 @@ def result(
         0.1,
         np.arange(number) if rank is None else np.array(rank),
         np.stack([apart < 0.035, apart < 0.04]),
+        np.full(modes, 0.012),
     )
 
 
@@ -238,6 +239,18 @@ def test_success_at_tight_goals_is_of_the_best_candidate_that_heads_for_one() ->
     assert figures([True, False, True], [roomy, tight, tight]) == (0, 0)  # the second at the tight goal comes too late
     assert figures([True, True], [roomy, beside]) == (0, 0)  # heads for it and does not get there
     assert figures([True, True], [roomy, roomy]) == (0, 0)  # no candidate heads for it
+
+
+def test_success_by_clearance_asks_for_the_goals_of_each_range_in_the_scenes_that_have_one() -> None:
+    """Two goals, of 4 and 20 mm free play; the second scene has roomy ones alone, the third no prediction."""
+    tight, roomy = [0.001, 0.1], [0.1, 0.001]
+    scenes = [
+        replace(result(0, [False, True], [tight, roomy]), clearance=np.array([0.004, 0.02])),
+        replace(result(1, [True], [roomy]), clearance=np.array([0.02, 0.03])),
+        replace(result(2, [], []), clearance=np.array([0.004, 0.02])),
+    ]
+    found = metrics.summarise(scenes, 2, 2).success.success_by_clearance_mm
+    assert {name: (rate.value, rate.n) for name, rate in found.items()} == {"0-5": (0, 2), "15-30": (1 / 3, 3), "30-": (1, 1)}
 
 
 def test_success_is_of_the_judged_and_modes_are_of_all_that_were_drawn() -> None:

@@ -377,6 +377,35 @@ def test_a_lease_is_renewed_as_long_as_its_holder_works(memory: Folder, monkeypa
     assert health.status(memory.url).to_dict()["working"] is None
 
 
+def test_those_who_share_a_lease_keep_out_who_wants_it_alone_and_the_reverse(memory: Folder) -> None:
+    with remote.working_copy(memory.url) as one, remote.working_copy(memory.url) as other:
+        with durable.lock(one, shared=True), durable.lock(other, shared=True):
+            with pytest.raises(LockedError, match=rf"{memory.url}: in use by process {os.getpid()}"):
+                health.gc(memory.url)
+            assert health.status(memory.url).to_dict()["working"]
+        with durable.lock(one), pytest.raises(LockedError, match="in use by"), durable.lock(other, shared=True):
+            raise AssertionError("two writers")
+    assert not [name for name in memory.children() if name.startswith(remote.LEASE)]
+
+
+def test_who_waits_for_a_lease_gets_it_and_renews_it(memory: Folder, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(remote, "LEASE_SECONDS", 0.4)
+    monkeypatch.setattr(remote, "PAUSE", 0.05)
+    memory.write(remote.LEASE, lease_of("another machine", "far away", 0.5, 1))
+    with remote.working_copy(memory.url) as root, durable.lock(root, patience=30):
+        time.sleep(1.0)
+        assert health.status(memory.url).to_dict()["working"].startswith(f"process {os.getpid()}")
+
+
+def test_tasks_share_the_work_on_a_bucket_and_the_last_one_publishes(small: Path, tmp_path: Path) -> None:
+    url = f"memory://{tmp_path.name}/shared"
+    for task in ("0/2", "1/2"):
+        assert Folder(url).read("manifest.json") is None
+        pipeline.generate(toy_recipe(DEMOS, SHARD_SIZE), url, units=task, engine="inline", table=TABLE)
+    pipeline.label(url, engine="inline", table=TABLE)
+    assert without_machinery(objects_of(Folder(url))) == without_machinery(files_of(small))
+
+
 def test_two_writes_on_one_condition_are_not_both_done(server: Server, memory: Folder) -> None:
     for folder in (memory, Folder(server.bucket())):
         first = folder.write_if("x", b"one", None)

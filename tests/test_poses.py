@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from dapdata.poses import (
     angle_between,
+    facing,
     inverse,
     nearest_symmetric,
     pose,
@@ -132,8 +133,24 @@ def test_half_turns_are_closed():
 @given(angles)
 def test_tilt_is_the_angle_from_upright_and_folds_where_the_symmetry_flips(angle):
     T = pose(rotation_about((1, 0, 0), angle))
-    assert tilt(T, "none") == pytest.approx(abs(angle), abs=1e-6)
-    assert tilt(T, "box") == pytest.approx(min(abs(angle), np.pi - abs(angle)), abs=1e-6)
+    assert tilt(T, "none", Z) == pytest.approx(abs(angle), abs=1e-6)
+    assert tilt(T, "box", Z) == pytest.approx(min(abs(angle), np.pi - abs(angle)), abs=1e-6)
+    assert tilt(T, "revolution", Z) == pytest.approx(min(abs(angle), np.pi - abs(angle)), abs=1e-6)
+
+
+@given(angles, angles)
+def test_tilt_forgives_a_roll_about_the_axis_of_revolution(roll, lean):
+    """Of a plate on its rim: the smallest over many turns about its axis, here y."""
+    Y = np.array([0.0, 1, 0])
+    T = pose(rotation_about((1, 0, 0), lean) @ rotation_about(Y, roll))
+    turned = [tilt(T @ pose(rotation_about(Y, turn)), "none", Y) for turn in np.linspace(-np.pi, np.pi, 721)]
+    assert tilt(T, "revolution", Y) == pytest.approx(min(turned), abs=0.006)
+
+
+def test_an_opening_that_points_up_faces_along_x():
+    T = pose(rotation_about((0, 0, 1), 0.3))
+    assert np.allclose(facing(T, np.array([0.0, 0, 1])), T[:3, 0])
+    assert np.allclose(facing(T, np.array([0.0, 0.6, 0.8])), T[:3, 1])
 
 
 def test_an_unknown_symmetry_is_named():

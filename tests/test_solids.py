@@ -124,6 +124,28 @@ def test_a_shelf_is_closed_but_for_its_front_and_its_boards_only_touch():
         assert (solids.signed_distance(way, kind, size, T).min() > 0) == is_open
 
 
+def test_a_plate_with_holes_is_solid_but_for_the_holes():
+    """Against its definition, point by point; and its boxes meet without overlap, as their volumes add up."""
+    x, y, margin = np.array([-0.05, 0.05]), np.array([-0.08, 0.0, 0.08]), (0.01, 0.02)
+    parts = solids.plate_with_holes(x, y, 0.06, margin, 0.02, 0.05)
+    kind, size, T = arrays(*parts)
+    assert np.allclose(solids.bounds(kind, size, T)[:, 0].min(axis=0), [-0.09, -0.13, 0.02])
+    assert np.allclose(solids.bounds(kind, size, T)[:, 1].max(axis=0), [0.09, 0.13, 0.05])
+    points = np.random.default_rng(0).uniform((-0.089, -0.129, 0.021), (0.089, 0.129, 0.049), (4000, 3))
+    in_hole = (np.abs(points[:, None, 0] - x).min(axis=1) < 0.03) & (np.abs(points[:, None, 1] - y).min(axis=1) < 0.03)
+    assert np.array_equal(solids.signed_distance(points, kind, size, T) > 0, in_hole)
+    assert size.prod(axis=1).sum() == pytest.approx(0.03 * (0.18 * 0.26 - 6 * 0.06**2))
+
+
+def test_the_centre_of_mass_is_that_of_a_mesh():
+    pytest.importorskip("trimesh")
+    parts = [part._replace(T=part.T @ pose(None, (0.3 * i, 0, 0))) for i, part in enumerate(scattered(3))]
+    mesh = solids.to_trimesh(*arrays(*parts), sections=256)
+    assert np.allclose(solids.centre_of_mass(*arrays(*parts)), mesh.center_mass, atol=2e-4)
+    raised = solids.moved(parts, pose(None, (0, 0, 1)))
+    assert np.allclose(solids.centre_of_mass(*arrays(*raised)) - mesh.center_mass, [0, 0, 1], atol=2e-4)
+
+
 @pytest.mark.parametrize("thing", [box((0.06, 0.06, 0.1), (0, 0, 0.05)), cylinder(0.03, 0.1, (0, 0, 0.05))])
 def test_free_play_between_two_boxes_is_the_gap_that_is_left(thing):
     walls = [box((0.5, 0.02, 0.1), (0, y, 0.05)) for y in (-0.044, 0.047)]

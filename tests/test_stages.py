@@ -6,10 +6,11 @@ from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 
+import numpy as np
 import pytest
 import toy_stages
 
-from dapdata import recipe, split, stages
+from dapdata import durable, recipe, split, stages
 from dapdata.config import SplitConfig
 
 
@@ -52,6 +53,16 @@ def test_a_version_is_part_of_the_key() -> None:
     assert changed(old, new) == ["cluster", "label"]
 
 
+def test_a_key_is_the_digest_of_all_that_it_follows_from() -> None:
+    resolved, unit = recipe.resolve(toy_stages.toy_recipe(60, 20)), stages.Unit(1, 20, 40)
+    plan, expected = stages.specs(toy_stages.STAGES, resolved), {}
+    for name, spec in plan.items():
+        rest = {"format": 1, "stage": name, **{part: spec[part] for part in ("version", "sections", "packages")}}
+        upstream = {need: expected[need] for need in spec["needs"]}
+        expected[name] = durable.digest({**rest, "seed": 5, "demos": [20, 40], "upstream": upstream})
+    assert stages.unit_keys(plan, 5, unit) == expected
+
+
 def test_units_cover_the_demos_once() -> None:
     found = stages.units(10, 4)
     assert [(unit.start, unit.stop) for unit in found] == [(0, 4), (4, 8), (8, 10)]
@@ -77,14 +88,20 @@ def test_changes_name_the_key_and_both_values() -> None:
 SHARES = SplitConfig(val=0.1, test=0.2)
 
 
+def assigned(rows: list[tuple[int, int, int]], seed: int) -> dict[int, str]:
+    """The split of each demo of (demo, container instance, object instance)."""
+    columns = np.array(rows, dtype=np.int64).reshape(-1, 3).T
+    return dict(zip(columns[0].tolist(), split.assign(*columns, SHARES, seed).tolist()))
+
+
 def distinct(demos: int) -> list[tuple[int, int, int]]:
     return [(demo, 1000 + demo, 2000 + demo) for demo in range(demos)]
 
 
 def test_a_longer_dataset_begins_with_the_splits_of_a_shorter_one() -> None:
-    long = split.assign(95, distinct(95), SHARES, 7)
+    long = assigned(distinct(95), 7)
     for demos in (1, 9, 10, 33):
-        assert split.assign(demos, distinct(demos), SHARES, 7) == {demo: long[demo] for demo in range(demos)}
+        assert assigned(distinct(demos), 7) == {demo: long[demo] for demo in range(demos)}
 
 
 def test_splits_have_their_shares() -> None:
@@ -96,7 +113,7 @@ def test_splits_have_their_shares() -> None:
 
 def test_no_instance_is_in_two_splits() -> None:
     shared = [(demo, demo % 23, demo % 17 if demo % 3 else 500 + demo) for demo in range(300)]
-    splits = split.assign(300, shared, SHARES, 1)
+    splits = assigned(shared, 1)
     for column in (1, 2):
         owners: dict[int, set[str]] = {}
         for row in shared:
@@ -109,4 +126,18 @@ def test_a_demo_between_two_splits_is_unused() -> None:
     wishes = list(islice(split.wanted(SHARES, 1), 10))
     train, test = wishes.index("train"), wishes.index("test")
     rows = [*sorted([(train, 1, 11), (test, 2, 22)]), (10, 1, 22)]
-    assert split.assign(11, rows, SHARES, 1)[10] == split.UNUSED
+    assert assigned(rows, 1)[10] == split.UNUSED
+
+
+@pytest.mark.parametrize("instances", [3, 40, 10**9])
+def test_splits_are_those_of_going_through_the_demos_one_by_one(instances: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(split, "BUFFER", 7)
+    random = np.random.default_rng(instances)
+    rows = [(demo, *random.integers(0, instances, 2).tolist()) for demo in range(100) if random.random() < 0.9]
+    wishes, owners, expected = list(islice(split.wanted(SHARES, 3), 100)), {}, {}
+    for demo, container, thing in rows:
+        known = {owners[name] for name in (("container", container), ("object", thing)) if name in owners}
+        expected[demo] = split.UNUSED if len(known) == 2 else next(iter(known), wishes[demo])
+        if len(known) < 2:
+            owners["container", container] = owners["object", thing] = expected[demo]
+    assert assigned(rows, 3) == expected

@@ -15,21 +15,30 @@ from pydantic import ValidationError
 from dapdata import recipe, rng, solids, tasks
 from dapdata.poses import inverse, pose, symmetric_distance
 from dapdata.records import GOAL_KINDS, REJECT_REASONS, ROLES, SYMMETRIES, Demo, Rejected, Scene
-from dapdata.simulate import PlacementConfig, demonstrate, judge
+from dapdata.simulate import HANG_SHIFT, PlacementConfig, demonstrate, judge
+from dapdata.tabletop import TabletopConfig
 
 TASKS = tasks.names()
+ON_A_TABLE = [task for task in TASKS if issubclass(tasks.load(task).Params, TabletopConfig)]
 RECIPES = sorted((Path(__file__).parent.parent / "recipes").rglob("*.yaml"))
 SCENES = 8
+ATTEMPTS = 10
 CONFIG = PlacementConfig()
 
 each_task = pytest.mark.parametrize("task", TASKS)
+each_task_on_a_table = pytest.mark.parametrize("task", ON_A_TABLE)
+
+
+def draw_scene(task: str, i: int) -> Scene | None:
+    """The first scene that a task draws from the streams of demo i."""
+    module = tasks.load(task)
+    drawn = (module.sample_scene(module.Params(), rng.stream(11, "scene", i, attempt)) for attempt in range(ATTEMPTS))
+    return next((scene for scene in drawn if isinstance(scene, Scene)), None)
 
 
 @cache
 def scenes(task: str) -> tuple[Scene, ...]:
-    module = tasks.load(task)
-    drawn = [module.sample_scene(module.Params(), rng.stream(11, "scene", i)) for i in range(SCENES)]
-    return tuple(scene for scene in drawn if isinstance(scene, Scene))
+    return tuple(scene for i in range(SCENES) if (scene := draw_scene(task, i)) is not None)
 
 
 @cache
@@ -51,22 +60,23 @@ def as_parts(kind, size, T, where) -> tuple:
 
 @each_task
 def test_the_same_seed_gives_the_same_bytes(task):
-    module = tasks.load(task)
     for i, scene in enumerate(scenes(task)[:3]):
-        again = module.sample_scene(module.Params(), rng.stream(11, "scene", i))
+        again = draw_scene(task, i)
+        assert again is not None
         assert bytes_of(again) == bytes_of(scene)
     assert len({bytes_of(scene) for scene in scenes(task)}) == len(scenes(task))
 
 
 @each_task
 def test_scenes_are_what_the_record_says(task):
-    assert len(scenes(task)) >= SCENES - 1
+    assert len(scenes(task)) == SCENES
     for scene in scenes(task):
         parts, goals = len(scene.part_kind), len(scene.T_container_goal)
         assert scene.part_size.shape == (parts, 3)
         assert scene.T_container_part.shape == (parts, 4, 4)
         assert scene.T_container_goal.shape == (goals, 4, 4)
         assert len(scene.goal_kind) == len(scene.goal_clearance) == goals > 0
+        assert np.allclose(np.linalg.norm(scene.goal_approach, axis=1), np.ones(goals))
         for T in (*scene.T_container_part, *scene.T_container_goal, scene.T_world_container, scene.T_world_object_start):
             assert np.allclose(T[:3, :3].T @ T[:3, :3], np.eye(3), atol=1e-9)
         assert (scene.part_size > 0).all()
@@ -93,14 +103,18 @@ def test_instances_are_digests_of_geometry_alone(task):
 
 
 @each_task
-def test_solids_overlap_nowhere(task):
-    """Points on the surface of every part lie in no other, clutter and container alike, by more than 0.1 mm."""
+def test_bodies_overlap_nowhere(task):
+    """Points on the surface of a part of the clutter lie in no other part, and none of these in it, by more than 0.1 mm.
+
+    The container is one body, and its own parts may be welded into each other.
+    """
     for scene in scenes(task)[:4]:
-        draw, count = np.random.default_rng(0), len(scene.part_kind)
+        draw, count, role = np.random.default_rng(0), len(scene.part_kind), scene.part_role
         low, high = solids.bounds(scene.part_kind, scene.part_size, scene.T_container_part).transpose(1, 0, 2)
         for p in range(count):
             one = as_parts(scene.part_kind, scene.part_size, scene.T_container_part, [p])
-            near = [q for q in range(count) if q != p and (low[q] < high[p]).all() and (high[q] > low[p]).all()]
+            bodies = [q for q in range(count) if q != p and (role[p] or role[q])]
+            near = [q for q in bodies if (low[q] < high[p]).all() and (high[q] > low[p]).all()]
             if near:
                 points = solids.surface_points(*one, 400, draw)
                 others = as_parts(scene.part_kind, scene.part_size, scene.T_container_part, near)
@@ -124,21 +138,25 @@ def test_candidates_differ(task):
     for scene in scenes(task):
         kind = SYMMETRIES[scene.symmetry_kind]
         for a, b in combinations(scene.T_container_goal, 2):
-            assert symmetric_distance(a, b, kind, scene.symmetry_axis)[0] > 0.01
+            shift, turn = symmetric_distance(a, b, kind, scene.symmetry_axis)
+            assert shift > 0.01 or turn > 0.5
 
 
 @each_task
 def test_goals_settle_where_they_were_proposed(task):
+    """A task proposes places that hold; some may be barred or shaky. On a peg they hold in another pose."""
     assert len(demos(task)) >= SCENES - 2
+    hangs = any(GOAL_KINDS[kind] == "peg" for demo in demos(task) for kind in demo.goal_kind)
     lost = Counter(REJECT_REASONS[code] for demo in demos(task) for code in demo.rejected_reason)
-    assert set(lost) <= {"unreachable", "shaken_off"}, "a task proposes places that hold; some may be barred or shaky"
+    assert set(lost) <= {"unreachable", "shaken_off"}
+    most_shift, most_turn = (HANG_SHIFT, np.pi / 3) if hangs else (0.002, 0.01)
     by_start = {scene.T_world_object_start.tobytes(): scene for scene in scenes(task)}
     for demo in demos(task):
         scene = by_start[demo.T_world_object_start.tobytes()]
         proposed = scene.T_world_container @ scene.T_container_goal
         for goal in demo.goals:
             shifts = [symmetric_distance(T, goal, SYMMETRIES[int(demo.symmetry_kind)], demo.symmetry_axis) for T in proposed]
-            assert min(shift + turn for shift, turn in shifts) < 0.002
+            assert any(shift < most_shift and turn < most_turn for shift, turn in shifts)
         assert len(demo.goals) + len(demo.rejected_goals) == len(proposed)
 
 
@@ -155,7 +173,7 @@ def test_the_oracle_passes_the_judge(task):
         assert judge(demo, demo.T_world_object_goal[None], CONFIG, "rpdiff")[0].reason in ("ok", "pushed")
 
 
-@each_task
+@each_task_on_a_table
 def test_a_start_in_any_rotation_hangs_over_the_table(task):
     module = tasks.load(task)
     up = []
@@ -174,7 +192,7 @@ def test_every_key_says_what_it_is(task):
         assert not field.is_required(), name
 
 
-@each_task
+@each_task_on_a_table
 def test_ranges_are_checked(task):
     params = tasks.load(task).Params
     assert params(yaw_deg=[10.0, 20.0]).yaw_deg == (10.0, 20.0)

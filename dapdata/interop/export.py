@@ -112,7 +112,8 @@ def demo_name(demo: int) -> str:
 
 def facts(dataset: Dataset, number: int) -> dict[str, Any]:
     """What the index tells of a demo: its number, split, task, instances, counts and digest."""
-    return {name: column[number].item() for name, column in dataset.index.items() if name not in PLACES}
+    values = {name: column[number] for name, column in dataset.index.items() if name not in PLACES}
+    return {name: int(value) if isinstance(value, np.integer) else value for name, value in values.items()}
 
 
 def readme(chosen: Chosen, form: card.Form) -> dict[str, bytes]:

@@ -99,7 +99,7 @@ def schema(chosen: Chosen, previews: bool) -> Any:
 
     index = chosen.dataset.index
     first, *others = [
-        pa.field(name, pa.string() if column.dtype.kind == "U" else pa.int64())
+        pa.field(name, pa.int64() if column.dtype.kind == "i" else pa.string())
         for name, column in index.items()
         if name not in PLACES
     ]
@@ -174,4 +174,4 @@ def _nested(arrays: Sequence[Array], kind: Any) -> Any:
 
 
 def _preview(sample: Any) -> bytes:
-    return pictures.png(pictures.preview(sample, *PANEL))
+    return pictures.file(pictures.preview(sample, *PANEL))

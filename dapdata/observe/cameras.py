@@ -13,7 +13,7 @@ import numpy as np
 from dapdata.observe import CamerasConfig, NoiseConfig
 from dapdata.observe.noise import PRESETS
 from dapdata.observe.raycast import corners
-from dapdata.poses import pose, rotation_by, transform
+from dapdata.poses import facing, pose, rotation_by, transform
 from dapdata.records import Array, Demo
 
 
@@ -38,7 +38,7 @@ def container_views(demo: Demo, cameras: CamerasConfig, noise: NoiseConfig, rng:
     """
     box = corners(demo.part_size, demo.T_container_part).reshape(-1, 3)
     focus = transform(demo.T_world_container, (box.min(0) + box.max(0))[None] / 2)[0]
-    out = demo.T_world_container[:3, :3] @ (demo.opening if np.hypot(*demo.opening[:2]) > 1e-6 else np.array([1.0, 0, 0]))
+    out = facing(demo.T_world_container, demo.opening)
     spread = cameras.container_yaw_spread_deg if cameras.container_views > 1 else 0.0
     yaws = np.degrees(np.arctan2(out[1], out[0])) + np.linspace(-spread, spread, cameras.container_views)
     return [

@@ -48,6 +48,7 @@ class Params(TabletopConfig):
     same_radius: bool = key(True, "one radius for a shelf, shrunk so that its columns fill the width; else one for a column")
     rows: int = key(0, "rows from front to back; 0: as many as fit", ge=0, le=20)
     row_shift: FactorRange = key((0.0, 0.2), "a single row's distance from mid-depth, either way, as a share of the depth")
+    row_is_straight: bool = key(False, "a single row has one draw of row_shift, not one for each column")
     column_pad: float = key(1.0, "half the room of a column in its row, in its radii; above 1 leaves gaps", ge=1, le=3)
     column_gap: LengthRange = key((0.001, 0.005), "gap between neighbouring columns on top of that", unit="m")
     missing_column: float = key(
@@ -138,9 +139,12 @@ def _fill_shelf(params: Params, shelf: Shelf, cans_high: int, rng: np.random.Gen
         radius = (shelf.width / across - max(params.column_gap)) / (2 * params.column_pad)
     largest = radius if params.same_radius else params.can_radius[1]
     columns: list[Column] = []
-    for row, row_x in enumerate(_row_positions(params, shelf, largest, rng)):
+    rows = _row_positions(params, shelf, largest, rng)
+    if params.rows == 1 and params.row_is_straight:
+        rows = [_single_row_shift(params, shelf, largest, rng)]
+    for row, row_x in enumerate(rows):
         for y, r in _column_positions(params, shelf.width, radius, rng):
-            x = _single_row_shift(params, shelf, r, rng) if params.rows == 1 else row_x
+            x = _single_row_shift(params, shelf, r, rng) if params.rows == 1 and not params.row_is_straight else row_x
             stack = _stack(params, r, shelf.ceiling - shelf.floor, cans_high, rng)
             missing = rng.uniform() < params.missing_column
             cans, spare = ((), stack[0]) if missing else (stack, stack[-1])

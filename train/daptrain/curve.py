@@ -242,9 +242,8 @@ def begun(out: Path, wanted: Asked) -> Curve:
 def write(out: Path, now: Curve) -> None:
     """Writes curve.json, curve.png and curve.html, each whole or not at all."""
     write_json(out, now)
-    picture = draw(now)
-    write_whole(out / "curve.png", picture)
-    write_whole(out / "curve.html", curve_page(now, picture).encode())
+    write_whole(out / "curve.png", draw(now))
+    write_whole(out / "curve.html", curve_page(now).encode())
 
 
 def write_json(out: Path, now: Curve) -> None:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from dapdata import loading, metrics, predictions
 from dapdata import rng as rngs
-from dapdata.config import EvalConfig
+from dapdata.config import EvalConfig, TrainConfig
 from dapdata.console import seldom
 from dapdata.errors import FormatError, UsageError
 from dapdata.loading import Dataset
@@ -29,6 +29,7 @@ from dapdata.poses import inverse, transform
 from dapdata.records import Placement
 from dapdata.report import Cost, Quantiles, Report
 from daptrain import baselines
+from daptrain.page import Material, report_page
 
 if TYPE_CHECKING:
     from daptrain.infer import Predictor, Proposal
@@ -100,6 +101,7 @@ def evaluate(
     predictor = _load(run, method, device, changes or {})
     dataset = loading.open(data if data is not None else data_of(run), split)
     config = EvalConfig.model_validate(dataset.recipe.get("eval", {}))
+    usual = TrainConfig.model_validate(dataset.recipe.get("train", {}))
     trials, k, protocol = trials or config.trials, k or config.k, protocol or config.protocol
     if draws is not None and draws < k:
         raise UsageError(f"draws: got {draws}, expected at least k ({k}): what is judged was drawn; give more, or a smaller k")
@@ -114,8 +116,12 @@ def evaluate(
     samples = [dataset[i] for i in range(min(trials, len(dataset)))]
     seed = int(dataset.recipe["seed"])
 
-    others = {name: _guess(name, samples, draws, seed, say) for name in baselines.NAMES} if references else {}
-    mine = _predict(predictor, samples, k, draws, seed, say) if predictor else _guess(method, samples, draws, seed, say)
+    def guess(name: str) -> Proposals:
+        return _guess(baselines.load(name, usual), name, samples, draws, seed, say)
+
+    others = {name: guess(name) for name in baselines.NAMES} if references else {}
+    mine = _predict(predictor, samples, k, draws, seed, say) if predictor else guess(method)
+    log = _log(run if predictor else None)
     path = predictions.write(folder / "predictions.npz", predictions.collect(mine.placements, k))
     report, results = metrics.judge_dataset(
         predictions.read(path),
@@ -130,14 +136,19 @@ def evaluate(
         weights=_weights(run if predictor else None),
         references={name: predictions.collect(other.placements, k) for name, other in others.items()},
         affordance=mine.affordance,
-        cost=_cost(mine, predictor, run, dataset),
+        cost=_cost(mine, predictor, dataset, log),
         seed=seed,
         workers=workers,
         origin=str(path),
         progress=say,
     )
-    film = _film(predictor, samples, mine, seed, say) if pictures else None
-    _write(folder, report, results[method], samples if pictures else [], film, say)
+    material = Material(
+        results[method],
+        samples if pictures else (),
+        _film(predictor, samples, mine, seed, say) if pictures else "",
+        log,
+    )
+    _write(folder, report, report_page(report, material, say))
     metrics.require_sound(report)
     return report.model_dump(mode="json", by_alias=True)
 
@@ -145,9 +156,9 @@ def evaluate(
 # Predicting ------------------------------------------------------------------------------------------------
 
 
-def _guess(name: str, samples: Sequence[Sample], draws: int, seed: int, say: Say) -> Proposals:
+def _guess(place: baselines.Method, name: str, samples: Sequence[Sample], draws: int, seed: int, say: Say) -> Proposals:
     """The placements of a baseline, in the order drawn."""
-    place, found = baselines.load(name), Proposals()
+    found = Proposals()
     for i, sample in enumerate(samples):
         demo = int(sample["meta/demo"])
         start = time.perf_counter()
@@ -277,10 +288,10 @@ def _weights(run: str | Path | None) -> dict[str, str]:
     return {path.name: sha256(path.read_bytes()).hexdigest() for path in files}
 
 
-def _cost(found: Proposals, predictor: Predictor | None, run: str | Path | None, dataset: Dataset) -> Cost:
+def _cost(found: Proposals, predictor: Predictor | None, dataset: Dataset, log: Sequence[Mapping[str, Any]]) -> Cost:
     prepare = _seconds(found.prepare_s) if found.prepare_s else None
     infer = _seconds(found.infer_s)
-    if predictor is None or run is None:
+    if predictor is None:
         return Cost(prepare_s=prepare, infer_s=infer)
     parameters = sum(p.numel() for network in (predictor.affordance, predictor.pose) for p in network.parameters())
     return Cost(
@@ -288,7 +299,7 @@ def _cost(found: Proposals, predictor: Predictor | None, run: str | Path | None,
         infer_s=infer,
         parameters=parameters,
         demos_used=predictor.config.demos or len(loading.open(dataset.root, "train")),
-        training_minutes=_training_minutes(Path(run) / "metrics.jsonl"),
+        training_minutes=_training_minutes(log),
         device=str(predictor.device),
     )
 
@@ -297,34 +308,32 @@ def _seconds(values: Sequence[float]) -> Quantiles:
     return metrics.quantiles(np.array(values))
 
 
-def _training_minutes(path: Path) -> float | None:
-    """Minutes that the networks of a run took, added up, from its log; None when there is none."""
-    spent: dict[str, float] = {}
+def _log(run: str | Path | None) -> list[dict[str, Any]]:
+    """What the run's training wrote down, step by step; empty for no run and for a log that is none."""
+    if run is None:
+        return []
+    from daptrain.loop import read_metrics
+
     try:
-        for line in path.read_text().splitlines():
-            entry = json.loads(line)
-            if "seconds" in entry:
-                spent[str(entry.get("net"))] = max(spent.get(str(entry.get("net")), 0.0), float(entry["seconds"]))
-    except (OSError, ValueError):
-        return None
+        return read_metrics(Path(run))
+    except ValueError:
+        return []
+
+
+def _training_minutes(log: Sequence[Mapping[str, Any]]) -> float | None:
+    """Minutes that the networks of a run took, added up; None when nobody wrote them down."""
+    spent: dict[str, float] = {}
+    for entry in log:
+        if "seconds" in entry:
+            spent[str(entry.get("net"))] = max(spent.get(str(entry.get("net")), 0.0), float(entry["seconds"]))
     return sum(spent.values()) / 60 if spent else None
 
 
 # Writing ---------------------------------------------------------------------------------------------------
 
 
-def _write(
-    folder: Path,
-    report: Report,
-    results: Sequence[metrics.SceneResult],
-    samples: Sequence[Mapping[str, Array]],
-    film: bytes | None,
-    say: Say,
-) -> None:
-    """Writes report.json and report.html, each whole or not at all; without samples there are no pictures of scenes."""
-    from daptrain.page import page
-
-    html = page(report, results, samples, film, say)
+def _write(folder: Path, report: Report, html: str) -> None:
+    """Writes report.json and report.html, each whole or not at all."""
     text = json.dumps(report.model_dump(mode="json", by_alias=True), indent=1)
     for name, content in {"report.json": text, "report.html": html}.items():
         staged = folder / f".{name}.part"
@@ -332,13 +341,13 @@ def _write(
         staged.replace(folder / name)
 
 
-def _film(predictor: Predictor | None, samples: Sequence[Sample], found: Proposals, seed: int, say: Say) -> bytes | None:
-    """The PNG of how one scene's samples come about: the first with several goals; None if there is nothing to show."""
+def _film(predictor: Predictor | None, samples: Sequence[Sample], found: Proposals, seed: int, say: Say) -> str:
+    """HTML on how one scene's samples come about: the first scene with several goals; empty if there is nothing to show."""
     if predictor is None or predictor.method != "dap":
-        return None
-    from daptrain.film import ROWS, film
+        return ""
+    from daptrain.film import ROWS, film, player
 
     readable = [s for s in samples if found.placements[int(s["meta/demo"])][0].status != UNREADABLE]
     several = [s for s in readable if len(s["goals/T_world_object"]) >= ROWS]
     say("pictures: from noise to one place")
-    return film(predictor, (several or readable)[0], seed) if readable else None
+    return player(film(predictor, (several or readable)[0], seed)) if readable else ""

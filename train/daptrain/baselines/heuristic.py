@@ -17,7 +17,7 @@ from dapdata.records import Placement
 from dapdata.solids import points_on_faces, upward_faces
 from daptrain.baselines.random import interior
 from daptrain.fit import ObjectFit, fit_object
-from daptrain.refine import CRITERIA, STEPS, observed_scene, rank, refine
+from daptrain.refine import CRITERIA, STEPS, observed_scene, rank, rank_collision_count, refine
 
 Array = NDArray[Any]
 
@@ -39,7 +39,7 @@ def place(
         k: How many.
         rng: Of this demo.
         steps: Of `refine`.
-        criteria: Of `rank`.
+        criteria: Of `rank`, or "collision" alone.
 
     Returns:
         k placements, or a single one with a status when the object cannot be fitted or nothing is inside.
@@ -54,7 +54,10 @@ def place(
         return [Placement(np.full((4, 4), np.nan), -np.inf, "no_surface")]
     T_world_box = refine(proposals, scene, fit, steps)
     T_world_object = T_world_box @ inverse(fit.T_world_box) @ sample["pose/T_world_object_start"]
-    scores = rank(T_world_box, scene, fit, criteria=criteria)
+    if "collision" in criteria:
+        scores = rank_collision_count(T_world_box, sample["container/points"], fit)
+    else:
+        scores = rank(T_world_box, scene, fit, criteria=criteria)
     return [Placement(T, float(score), "ok") for T, score in zip(T_world_object, scores)]
 
 

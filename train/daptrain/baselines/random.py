@@ -15,7 +15,7 @@ Array = NDArray[Any]
 
 
 def place(sample: dict[str, Array], k: int, rng: np.random.Generator) -> list[Placement]:
-    """Upright poses of any turn with their centres uniform in the box around the container, in no order.
+    """Upright poses of any turn with their centres uniform in `interior`, in no order.
 
     Args:
         sample: One demo's arrays by shard path.
@@ -29,7 +29,13 @@ def place(sample: dict[str, Array], k: int, rng: np.random.Generator) -> list[Pl
 
 
 def interior(sample: dict[str, Array]) -> tuple[Array, Array]:
-    """(3,) low and high corner of the box around the container's own parts, container frame, m."""
+    """(3,) low and high corner of the box in which an upright object's centre may be, container frame, m.
+
+    That is the box around the container's own parts; of one that opens upwards, half the object's height higher.
+    """
     own = sample["scene/role"] == ROLES.index("container")
     boxes = bounds(sample["scene/kind"][own], sample["scene/size"][own], sample["scene/T_container_part"][own])
-    return boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)
+    low, high = boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)
+    if sample["scene/opening"][2] > 0.5:
+        high[2] += bounds(*(sample[f"object_parts/{name}"] for name in ("kind", "size", "T_object_part")))[:, 1, 2].max()
+    return low, high

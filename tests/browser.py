@@ -1,0 +1,81 @@
+"""Opens a page in a headless Chromium, does things to it, and tells what came of it: no driver, nothing but the browser.
+
+The page is copied, and gets two scripts: the first collects errors, the second is the test's own. It runs as the body of an
+async function once the page is drawn, and what it returns comes back. 3-D views are drawn in software.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import subprocess
+from html import unescape
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "chrome"))), None)
+needs_browser = pytest.mark.skipif(CHROMIUM is None, reason="no chromium here")
+
+FLAGS = (
+    "--headless --no-sandbox --disable-gpu --disable-quic --no-first-run --disable-background-networking "
+    "--disable-component-update --disable-sync --use-gl=angle --use-angle=swiftshader --enable-unsafe-swiftshader "
+    "--hide-scrollbars --virtual-time-budget=60000"
+)
+COLLECT = """<script>
+const problems = [], requests = [];
+addEventListener("error", e => problems.push(String(e.message)));
+addEventListener("unhandledrejection", e => problems.push(String(e.reason)));
+console.error = (...words) => problems.push(words.join(" "));
+const watch = new PerformanceObserver(list => requests.push(...list.getEntries().map(e => e.name)));
+watch.observe({ type: "resource", buffered: true });
+</script>"""
+ACT = """<script>
+const until = async holds => { for (let i = 0; i < 400 && !holds(); i++) await new Promise(done => setTimeout(done, 50)); };
+const $ = selector => document.querySelector(selector), $$ = selector => [...document.querySelectorAll(selector)];
+const drawn = () => !$("#library") && $$(".plot, .stage").every(box => box.querySelector(".main-svg"));
+(async () => {
+  await until(drawn);
+  let answer = null;
+  try { answer = await (async () => { %s })(); } catch (error) { problems.push(String(error)); }
+  const told = { answer, problems, requests: requests.filter(name => !/^(data|blob):/.test(name)), drawn: drawn() };
+  document.documentElement.innerHTML = "";
+  document.body.append(Object.assign(document.createElement("pre"), { id: "told", textContent: JSON.stringify(told) }));
+})();
+</script>"""
+
+
+def open_page(html: str, folder: Path, script: str = "", fragment: str = "", width: int = 1280) -> Any:
+    """What a script returns in a page, after checking that the page was drawn, without errors, from its one file.
+
+    Args:
+        html: The page.
+        folder: Where files may be left.
+        script: JavaScript; `$` and `$$` find elements, `until(holds)` waits.
+        fragment: Of the address, such as "view-3".
+        width: Of the window, px.
+    """
+    assert "<head>" in html
+    assert "</body>" in html
+    page = folder / "opened.html"
+    page.write_text(html.replace("<head>", f"<head>{COLLECT}", 1).replace("</body>", ACT % script + "</body>"), "utf-8")
+    flags = [*FLAGS.split(), f"--window-size={width},900", f"--user-data-dir={folder / 'user'}", "--dump-dom"]
+    done = subprocess.run(
+        [str(CHROMIUM), *flags, f"file://{page}#{fragment}"],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        env=os.environ | {"HOME": str(folder)},
+        check=True,
+    )
+    shutil.rmtree(folder / "user", ignore_errors=True)
+    found = re.search(r'<pre id="told">(.*?)</pre>', done.stdout, re.DOTALL)
+    assert found, done.stderr[-2000:]
+    told = json.loads(unescape(found[1]))
+    assert told["problems"] == []
+    assert told["requests"] == []
+    assert told["drawn"]
+    return told["answer"]

@@ -4,6 +4,9 @@ Everything that is published goes through here, in this order: write in `staging
 folders from the leaves up, rename, fsync the folder that holds the new name. A reader or a crash therefore sees
 a committed folder whole or not at all. zarr writes its chunks by rename too, but never fsyncs, and reads a
 missing chunk as fill values without a word; hence a whole unit is committed at once and named by its hashes.
+
+A dataset in an object store is worked on in a copy on this machine (remote.py). What is made durable in the copy is
+repeated in the store by the copy's `Mirror`, so there is one order of steps for both.
 """
 
 from __future__ import annotations
@@ -18,10 +21,10 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from hashlib import file_digest, sha256
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, Protocol
 
 from dapdata.errors import EnvironmentProblem, LockedError
 
@@ -31,6 +34,30 @@ FULL_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 NO_PERMISSION = (errno.EACCES, errno.EPERM, errno.EROFS)
 
 observer: Callable[[str, Path], None] | None = None  # tests set it to see, or to stop at, every fsync and rename
+
+
+class Mirror(Protocol):
+    """Repeats elsewhere what is made durable below a folder of this machine."""
+
+    def hold(self, shared: bool, deadline: float) -> AbstractContextManager[None]:
+        """Keeps other writers away there, as `lock` does here; brings here what they have done until now."""
+
+    def commit(self, folder: Path) -> bool:
+        """A folder was moved to its place here; False if there is another there already, which is then here too."""
+
+    def replace(self, path: Path) -> None:
+        """A file has new bytes."""
+
+    def remove(self, path: Path) -> None:
+        """A file or a folder is to go."""
+
+
+mirrors: dict[Path, Mirror] = {}  # by folder; empty unless a dataset in an object store is worked on
+
+
+def mirror_of(path: Path) -> Mirror | None:
+    """The mirror of the working copy that a path is in."""
+    return next((mirror for root, mirror in mirrors.items() if path.is_relative_to(root)), None)
 
 
 def _note(action: str, path: Path) -> None:
@@ -89,7 +116,7 @@ def staged(root: Path, name: str) -> Iterator[Path]:
 
 
 def commit(folder: Path, target: Path) -> bool:
-    """Moves a staged folder to its place for good; False if there is something already (then nothing is moved).
+    """Moves a staged folder to its place for good; False if there is something already (then nothing is changed).
 
     A single file may be moved too; it replaces one that has its name.
     """
@@ -108,7 +135,8 @@ def commit(folder: Path, target: Path) -> bool:
             return False
         raise
     _fsync(target.parent)
-    return True
+    mirror = mirror_of(target)
+    return mirror is None or mirror.commit(target)
 
 
 def replace_file(path: Path, data: bytes) -> None:
@@ -125,10 +153,14 @@ def move_file(source: Path, target: Path) -> None:
     _fsync(source)
     _rename(source, target)
     _fsync(target.parent)
+    if mirror := mirror_of(target):
+        mirror.replace(target)
 
 
 def remove_file(path: Path) -> None:
     """Takes a name away for good; a name that isn't there is fine."""
+    if mirror := mirror_of(path):
+        mirror.remove(path)
     if path.exists():
         _note("remove", path)
         path.unlink()
@@ -137,6 +169,8 @@ def remove_file(path: Path) -> None:
 
 def discard(root: Path, path: Path) -> None:
     """Deletes a folder so that a crash leaves it whole or gone: it is renamed into staging first."""
+    if mirror := mirror_of(path):
+        mirror.remove(path)
     make_folder(root / STAGING)
     grave = Path(tempfile.mkdtemp(prefix="discarded-", dir=root / STAGING))
     _rename(path, grave / path.name)
@@ -159,6 +193,11 @@ def sweep(root: Path) -> None:
             leftover.unlink()
 
 
+def this_process() -> str:
+    """How a holder of a lock is named to others."""
+    return f"process {os.getpid()} on {socket.gethostname()} ({' '.join(sys.argv)[:200]})"
+
+
 @contextmanager
 def lock(root: Path, *, shared: bool = False, patience: float = 0.0) -> Iterator[None]:
     """Holds the dataset for one writer, or for several that share it; readers need no lock. It dies with its process.
@@ -176,15 +215,18 @@ def lock(root: Path, *, shared: bool = False, patience: float = 0.0) -> Iterator
     """
     make_folder(root)
     with (root / ".lock").open("a+") as file:
-        _flock(root, file, fcntl.LOCK_SH if shared else fcntl.LOCK_EX, time.monotonic() + patience)
-        mine = f"process {os.getpid()} on {socket.gethostname()} ({' '.join(sys.argv)[:200]})\n"
+        deadline = time.monotonic() + patience
+        _flock(root, file, fcntl.LOCK_SH if shared else fcntl.LOCK_EX, deadline)
+        mine = f"{this_process()}\n"
         if not shared:
             file.truncate(0)
             sweep(root)
         file.write(mine)
         file.flush()
+        mirror = mirror_of(root)
         try:
-            yield
+            with mirror.hold(shared, deadline) if mirror else nullcontext():
+                yield
         finally:
             if not shared:
                 sweep(root)

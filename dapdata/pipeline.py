@@ -25,20 +25,21 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from dapdata import durable, engines, manifest, recipe, store, tasks, units
+from dapdata import durable, engines, manifest, recipe, remote, store, tasks, units
 from dapdata.engines import Failure, Job
 from dapdata.errors import EnvironmentProblem, FormatError, LockedError, QuarantineError, UsageError, require
 from dapdata.manifest import MissingEntry
 from dapdata.plan import Before, Cost, Plan, before, make_plan, measured_cost, missing
 from dapdata.recipe import Recipe
 from dapdata.records import Cloud, Demo, Labels, Rejected, Superpoints
+from dapdata.remote import Place
 from dapdata.stages import Draw, Inputs, Layout, Sections, Spec, Stage, Unit, specs, stripe
 from dapdata.stages import units as units_of
 
@@ -93,7 +94,7 @@ Progress = Callable[[int, int], None]  # demos done, demos in all
 
 def generate(
     recipe_or_path: Recipe | str | Path,
-    out: str | Path | None = None,
+    out: Place | None = None,
     *,
     workers: int | None = 1,
     engine: str = "local",
@@ -104,12 +105,12 @@ def generate(
     dry_run: bool = False,
     progress: Progress | None = None,
     table: str = __name__,
-) -> Path | Plan:
+) -> Place | Plan:
     """Makes scenes, settled demonstrations and point clouds; goes on where an earlier call stopped.
 
     Args:
         recipe_or_path: What to make.
-        out: The dataset's folder; `data/<recipe name>` by default.
+        out: The dataset's folder, or the URL of one in a bucket; `data/<recipe name>` by default.
         workers: Processes; None for as many as there are cores.
         engine: Where they work, see engines/.
         memory: What each of them may take, GB; by default an equal part of most of what there is.
@@ -121,7 +122,7 @@ def generate(
         table: Module with STAGES and parse; tests put toys here.
 
     Returns:
-        The dataset's folder, or the Plan.
+        The dataset's folder or URL, or the Plan.
 
     Raises:
         QuarantineError: if units have failed too often, and `allow_missing` was not asked for; the others are done.
@@ -131,15 +132,16 @@ def generate(
             "--fresh: would delete what other tasks make, expected none with --units; delete the folder before them"
         )
     given = recipe_or_path if not isinstance(recipe_or_path, (str, Path)) else recipe.load(recipe_or_path)
-    root, stages = Path(out) if out else Path("data") / given.name, import_module(table).STAGES
+    place, stages = remote.locate(out or Path("data") / given.name), import_module(table).STAGES
     resolved = recipe.resolve(given)
-    command = _Command(root, table, stages, GENERATE, given, resolved, specs(stages, resolved), units)
-    means = _Means(workers, engine, memory, allow_missing, progress, fresh)
-    return command.plan(fresh) if dry_run else command.run(means)
+    with remote.working_copy(place, units=True) as root:
+        command = _Command(place, root, table, stages, GENERATE, given, resolved, specs(stages, resolved), units)
+        means = _Means(workers, engine, memory, allow_missing, progress, fresh)
+        return command.plan(fresh) if dry_run else command.run(means)
 
 
 def label(
-    dataset: str | Path,
+    dataset: Place,
     overrides: Sequence[str] = (),
     *,
     workers: int | None = 1,
@@ -150,34 +152,36 @@ def label(
     dry_run: bool = False,
     progress: Progress | None = None,
     table: str = __name__,
-) -> Path | Plan:
+) -> Place | Plan:
     """Makes superpoints, affordance and correspondence of a generated dataset, and its shards. Never simulates.
 
     Args:
-        dataset: The dataset's folder.
+        dataset: The dataset's folder or URL.
         overrides: Such as "label.eps_place=0.02"; only sections that the stages from `cluster` on read.
         workers: See generate, as the others.
 
     Raises:
         UsageError: for an override of what earlier stages read.
     """
-    root, stages = Path(dataset), import_module(table).STAGES
-    found = manifest.read(root)
-    given = import_module(table).parse(found.recipe, overrides, str(root / manifest.MANIFEST))
-    resolved = recipe.resolve(given)
-    made = {name: entry.spec for name, entry in found.stages.items() if name in GENERATE and entry.units}
-    if made.keys() != set(GENERATE):
-        raise FormatError(f"{root}: stages {sorted(made)}, expected {', '.join(GENERATE)}; run `dapdata generate` first")
-    _refuse_upstream(found.recipe, resolved, made)
-    lost = tuple(entry for entry in found.missing if entry.stage in GENERATE)
-    command = _Command(root, table, stages, LABEL, given, resolved, specs(stages, resolved) | made, units, lost)
-    return command.plan(False) if dry_run else command.run(_Means(workers, engine, memory, allow_missing, progress))
+    place, stages = remote.locate(dataset), import_module(table).STAGES
+    with remote.working_copy(place, units=True) as root:
+        found = manifest.read(root)
+        given = import_module(table).parse(found.recipe, overrides, str(root / manifest.MANIFEST))
+        resolved = recipe.resolve(given)
+        made = {name: entry.spec for name, entry in found.stages.items() if name in GENERATE and entry.units}
+        if made.keys() != set(GENERATE):
+            raise FormatError(f"{root}: stages {sorted(made)}, expected {', '.join(GENERATE)}; run `dapdata generate` first")
+        _refuse_upstream(found.recipe, resolved, made)
+        lost = tuple(entry for entry in found.missing if entry.stage in GENERATE)
+        command = _Command(place, root, table, stages, LABEL, given, resolved, specs(stages, resolved) | made, units, lost)
+        return command.plan(False) if dry_run else command.run(_Means(workers, engine, memory, allow_missing, progress))
 
 
+@remote.on_copy()
 def attach(dataset: str | Path, pictures: Mapping[str, bytes]) -> None:
     """Adds pictures, by their path such as "preview/goals.png", to a labelled dataset, its manifest and its card."""
     root = Path(dataset)
-    with durable.disk_problems(root), durable.lock(root):
+    with durable.disk_problems(remote.scratch_of(root)), durable.lock(root):
         units.attach(root, pictures)
 
 
@@ -207,7 +211,8 @@ class _Means:
 class _Command:
     """Some stages of one dataset, to be planned or run."""
 
-    root: Path
+    place: Place  # as the user names it
+    root: Path  # the same, or its working copy
     table: str
     stages: Sequence[Stage]
     wanted: Sequence[str]
@@ -243,14 +248,15 @@ class _Command:
         mine = [stage for stage in self.stages if stage.name in self.wanted]
         previous: Before | None = None if fresh else before(self.root)
         cost = measured_cost(self.root, REFERENCE_COST)
-        return make_plan(self.layout, mine, self.mine, self.resolved, previous, cost, fresh)
+        plan = make_plan(self.layout, mine, self.mine, self.resolved, previous, cost, fresh)
+        return replace(plan, root=str(self.place))
 
-    def run(self, means: _Means) -> Path:
+    def run(self, means: _Means) -> Place:
         """Makes the missing units; publishes what is there then, or leaves that to whoever makes the others."""
         _check_packages(stage for stage in self.stages if stage.name in self.wanted)
         engine, needed = engines.get(means.engine), int(self.plan(means.fresh).gigabytes * 1e9)
         _check_space(self.root, needed)
-        with durable.disk_problems(self.root, needed):
+        with durable.disk_problems(remote.scratch_of(self.root), needed):
             if self.stripe is None:
                 with durable.lock(self.root):
                     if means.fresh:
@@ -265,7 +271,7 @@ class _Command:
                     if is_last:
                         with durable.lock(self.root, patience=PATIENCE):
                             self._publish(means)
-        return self.root
+        return self.place
 
     def _make(self, engine: engines.Engine, means: _Means, needed: int) -> None:
         """Makes the units of which something is missing."""
@@ -274,8 +280,8 @@ class _Command:
             return
         left = {"recipe": self.resolved, "specs": self.specs, "stages": self.wanted, "shard_stage": self.layout.shard_stage}
         durable.replace_file(self.root / manifest.PROGRESS, json.dumps(left).encode())  # specs stay in their order
-        if self.stripe is None:
-            shutil.rmtree(self.root / QUARANTINE, ignore_errors=True)
+        if self.stripe is None and (self.root / QUARANTINE).is_dir():
+            durable.discard(self.root, self.root / QUARANTINE)
         for unit in jobs.values():
             durable.remove_file(self._story(unit))
         try:
@@ -291,7 +297,8 @@ class _Command:
         return {self._job(unit, needed): unit for unit in todo}
 
     def _job(self, unit: Unit, needed: int) -> str:
-        place, stages, root = (unit.index, unit.start, unit.stop), tuple(self.wanted), str(self.root.absolute())
+        place, stages = (unit.index, unit.start, unit.stop), tuple(self.wanted)
+        root = str(self.place.absolute() if isinstance(self.place, Path) else self.place)
         return units.Work(root, self.table, self.resolved, self.specs, place, stages, needed).to_json()
 
     def _work(self, engine: engines.Engine, jobs: Mapping[str, Unit], means: _Means) -> None:
@@ -323,6 +330,7 @@ class _Command:
     def _wait_for(self, made: Iterable[Unit]) -> None:
         """Waits until units are seen here that were made elsewhere: network file systems may take a while to tell."""
         deadline = time.monotonic() + SEEN_WITHIN
+        remote.refresh(self.root)
         for unit in made:
             while self._stage_to_make(unit):
                 if time.monotonic() > deadline:
@@ -373,6 +381,7 @@ class _Command:
     def _missing(self, means: _Means) -> list[MissingEntry] | None:
         """What the dataset is published without; None while units are not there that it should not be without."""
         found = list(self.lost)
+        remote.refresh(self.root)
         for unit in self.units:
             stage = self._stage_to_make(unit)
             if stage is not None:
@@ -442,6 +451,8 @@ def _check_packages(stages: Iterable[Stage]) -> None:
 
 def _check_space(root: Path, needed: int) -> None:
     """Stops before work begins if the estimate cannot fit."""
+    if durable.mirror_of(root):
+        return  # of a dataset in a store, no more than a unit a worker is on this machine
     free = shutil.disk_usage(durable.existing(root)).free
     if needed > free:
         raise EnvironmentProblem(
@@ -463,13 +474,16 @@ def _clear(root: Path) -> None:
 def _leave_nothing(root: Path) -> None:
     """Removes a folder in which no unit was finished: a recipe that admits no demo leaves no trace."""
     if not any(path.name != ".lock" and path.name != manifest.PROGRESS for path in root.iterdir()):
+        durable.remove_file(root / manifest.PROGRESS)
         shutil.rmtree(root)
 
 
 def replay(path: str) -> None:
     """Runs a quarantined unit in this process, where a debugger sees it."""
-    work = json.loads(Path(path).read_bytes())["work"]
-    with durable.lock(Path(work["root"]), shared=True):
+    folder, _, name = path.rpartition("/")
+    with remote.working_copy(folder, files=(name,)) as copy:
+        work = json.loads((copy / name).read_bytes())["work"]
+    with remote.working_copy(work["root"], files=()) as root, durable.lock(root, shared=True):
         print(engines.answer(units.run_unit(json.dumps(work))))
 
 

@@ -14,8 +14,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from dapdata import remote
 from dapdata.errors import UsageError
 from dapdata.recipe import Recipe
+from dapdata.remote import Place
 from dapdata.stages import units
 
 MOST_TASKS = 100  # by default; many clusters refuse arrays of more than 1000
@@ -77,13 +79,14 @@ class Limits:
         return ["--nodes=1", "--ntasks=1", f"--cpus-per-task={self.workers}", f"--mem={memory}M", f"--time={self.time}", *where]
 
 
-def script(recipe: Recipe, path: Path, out: Path | None, overrides: Sequence[str], limits: Limits, allow_missing: bool) -> str:
+def script(recipe: Recipe, path: Path, out: Place | None, overrides: Sequence[str], limits: Limits, allow_missing: bool) -> str:
     """A Bash script that submits what makes a dataset; its paths are absolute, its Python is this one.
 
     Args:
         recipe: As it is asked for; only its name and its number of units are looked at.
         path: The recipe's file, which the tasks read.
-        out: The dataset's folder; `data/<recipe name>` by default.
+        out: The dataset's folder, or its URL; `data/<recipe name>` by default. What tasks say lies beside the folder, or
+            in this one.
         overrides: Such as "label.eps_place=0.02", for the tasks.
         limits: What each task is to have.
         allow_missing: Whether the dataset may be published without units that fail.
@@ -93,7 +96,9 @@ def script(recipe: Recipe, path: Path, out: Path | None, overrides: Sequence[str
     """
     if not TIME.fullmatch(limits.time):
         raise UsageError(f"--time: got '{limits.time}', expected minutes, HH:MM:SS or D-HH:MM:SS, such as 04:00:00")
-    folder = (out or Path("data") / recipe.name).absolute()
+    place = remote.locate(out or Path("data") / recipe.name)
+    folder = place.absolute() if isinstance(place, Path) else place
+    logs = f"{folder if isinstance(folder, Path) else Path(recipe.name).absolute()}-slurm"
     count = len(units(recipe.demos, recipe.shard_size))
     tasks = min(count, limits.tasks or MOST_TASKS)
     dapdata, more = [sys.executable, "-m", "dapdata"], ["--workers", str(limits.workers), "--memory", f"{limits.memory:g}"]
@@ -107,8 +112,8 @@ def script(recipe: Recipe, path: Path, out: Path | None, overrides: Sequence[str
         workers=limits.workers,
         processes="process" if limits.workers == 1 else "processes",
         folder=folder,
-        logs=shlex.quote(f"{folder}-slurm"),
-        output=shlex.quote(f"{folder}-slurm".replace("%", "%%") + "/%x-%j.out"),
+        logs=shlex.quote(logs),
+        output=shlex.quote(logs.replace("%", "%%") + "/%x-%j.out"),
         limits=shlex.join(limits.options()),
         last=tasks - 1,
         generate=shlex.join([*dapdata, "generate", str(path.absolute()), "--out", str(folder), *changes, *more]),

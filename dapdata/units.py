@@ -18,7 +18,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from dapdata import card, croissant, durable, manifest, rng, split, store
+from dapdata import card, croissant, durable, manifest, remote, rng, split, store
 from dapdata.config import SplitConfig
 from dapdata.errors import CorruptionError, DapdataError, EnvironmentProblem, UsageError
 from dapdata.manifest import Manifest, MissingEntry, Rejects, SplitEntry, StageEntry, UnitEntry
@@ -44,7 +44,7 @@ Made = dict[int, Record]  # by demo
 class Work:
     """A job: what to make of which demos. As JSON it holds names and numbers only."""
 
-    root: str
+    root: str  # the dataset's folder or URL
     table: str  # module that holds STAGES, in order, and parse(resolved) -> recipe
     recipe: dict[str, Any]
     specs: dict[str, Spec]
@@ -74,18 +74,19 @@ def run_unit(text: str) -> str:
     """
     work = Work(**json.loads(text))
     try:
-        with durable.disk_problems(Path(work.root), work.needed):
-            return json.dumps(_make(work))
+        with remote.working_copy(work.root, files=()) as root, durable.disk_problems(remote.scratch_of(root), work.needed):
+            return json.dumps(_make(work, root))
     except DapdataError as error:
         return json.dumps({"error": [type(error).__name__, str(error)]})
 
 
-def _make(work: Work) -> dict[str, Any]:
+def _make(work: Work, root: Path) -> dict[str, Any]:
     table = import_module(work.table)
     stages: dict[str, Stage] = {stage.name: stage for stage in table.STAGES}
-    layout = layout_of(Path(work.root), table.STAGES, work.specs, work.recipe)
+    layout = layout_of(root, table.STAGES, work.specs, work.recipe)
     _check_versions(work, specs(table.STAGES, work.recipe))
     recipe, unit = table.parse(work.recipe), Unit(*work.unit)
+    remote.pull(root, [layout.path(name, unit) for name in layout.plan])
     made: dict[str, Made] = {}
     told = []
     for stage in (stages[name] for name in work.stages):
@@ -180,6 +181,7 @@ def _no_demo(recipe: Any, stage: Stage, demo: int, reasons: Counter[str]) -> str
 def _load(layout: Layout, stage: Stage, unit: Unit) -> Made:
     """The records of a committed unit, after its files were compared with their hashes."""
     folder = layout.folder(stage.name, unit)
+    remote.fill(folder)
     record = store.read_record(folder)
     damage = next(store.damaged_files(folder, record), None)
     if damage or record["key"] != layout.key(stage.name, unit):

@@ -63,7 +63,7 @@ def toy_copy(toy: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(toy, tmp_path / "toy"))
 
 
-def make_toy(root: Path, demos: int = 8, shard_size: int = 3, workers: int = 1, engine: str = "inline") -> Path:
+def make_toy(root: Path | str, demos: int = 8, shard_size: int = 3, workers: int = 1, engine: str = "inline") -> Path:
     """Generates and labels with the toy stages."""
     pipeline.generate(toy_stages.toy_recipe(demos, shard_size), root, workers=workers, engine=engine, table="toy_stages")
     pipeline.label(root, workers=workers, engine=engine, table="toy_stages")

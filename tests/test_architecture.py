@@ -20,12 +20,12 @@ DAPTRAIN = sorted((ROOT / "train/daptrain").rglob("*.py"))
 LINES = (
     ("errors", "rng", "poses", "config"),
     ("records", "strict_yaml", "durable", "clouds", "console"),
-    ("solids", "meshes", "keys", "slic", "split", "matching", "tables"),
+    ("solids", "meshes", "keys", "slic", "split", "matching", "tables", "buckets"),
     ("tabletop",),
     ("tasks",),
     ("simulate", "observe", "cluster", "labels"),
     ("recipe", "store", "stages", "engines", "manifest", "card", "report", "predictions"),
-    ("croissant",),
+    ("croissant", "remote"),
     ("plan", "units", "slurm"),
     ("pipeline",),
     ("loading", "draw", "schemas", "plots"),
@@ -38,7 +38,7 @@ LINES = (
 LINE = {module: number for number, modules in enumerate(LINES) for module in modules}
 DOMAIN = frozenset(("solids", "meshes", "tabletop", "tasks", "simulate", "observe", "cluster", "labels"))
 MUST_NOT_KNOW = {
-    **dict.fromkeys(("store", "stages", "engines", "manifest"), DOMAIN),
+    **dict.fromkeys(("store", "stages", "engines", "manifest", "buckets", "remote"), DOMAIN),
     **dict.fromkeys(
         ("loading", "metrics", "card", "croissant", "show", "interop"), frozenset(("pipeline", "engines", "tasks"))
     ),
@@ -60,6 +60,8 @@ DOORS = {
     "yaml": {"strict_yaml"},
     "plotly": {"plots"},
     "rerun": {"live"},
+    "fsspec": {"buckets"},
+    "s3fs": {"buckets"},
 }
 HEAVY = (
     "pybullet",
@@ -75,6 +77,8 @@ HEAVY = (
     "rich",
     "plotly",
     "rerun",
+    "fsspec",
+    "s3fs",
 )
 QUATERNION_WORDS = ("quat", "getEulerFromQuaternion", "as_quat")
 

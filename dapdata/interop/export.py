@@ -120,7 +120,7 @@ def readme(chosen: Chosen, form: card.Form) -> dict[str, bytes]:
     """The dataset's card with what is particular to a format, and its pictures, by path."""
     dataset, found = chosen.dataset, chosen.dataset.manifest
     numbers = np.concatenate([*chosen.splits.values()])
-    pictures = {path: (dataset.root / path).read_bytes() for path in found.files if path.startswith(f"{manifest.PREVIEWS}/")}
+    pictures = dataset.files([path for path in found.files if path.startswith(f"{manifest.PREVIEWS}/")])
     text = card.render(
         found.model_copy(update={"shards": [], "stages": {}}).model_dump(mode="json"),
         {name: entry.spec for name, entry in found.stages.items() if entry.units},
@@ -197,8 +197,8 @@ def _about(export: Export) -> dict[str, Any]:
     return dict(json.loads(json.dumps(about)))
 
 
-def _refuse_inside(out: str | Path, target: Path, root: Path) -> None:
-    if target.resolve().is_relative_to(root.resolve()):
+def _refuse_inside(out: str | Path, target: Path, root: str | Path) -> None:
+    if target.resolve().is_relative_to(Path(root).resolve()):
         raise UsageError(f"{out}: in the dataset's own folder, expected a place outside of {root}; choose another with --out")
 
 

@@ -217,7 +217,7 @@ def _record(layout: stages.Layout, stage: stages.Stage, unit: stages.Unit, array
     for demo in range(unit.start, unit.stop):
         row: dict[str, Any] = {"demo": demo, "sha256": random.bytes(32).hex()}
         if stage.is_shard:
-            row |= {"seed": 0, **{name: int(random.integers(2**62)) for name in health.INSTANCES}, "attempts": 1}
+            row |= {"seed": 0, **{name: int(random.integers(2**62)) for name in health.INSTANCES}, "attempts": 1, "task": 0}
             row |= {name: int(random.integers(9000)) for name in (*units.COUNTED, "positives")}
         rows.append(row)
     return {
@@ -378,7 +378,7 @@ def machine() -> Mapping[str, Any]:
     return bench.machine()
 
 
-def report(demos: int, shard_sizes: Sequence[int], few: int, published: Sequence[int]) -> Iterator[str]:
+def report(demos: int, shard_sizes: Sequence[int], few: int, publish_sizes: Sequence[int]) -> Iterator[str]:
     """The tables of docs/scale.md."""
     yield ", ".join(f"{name} {value}" for name, value in machine().items())
     costs, start = [make(few, 50, workers) for workers in (1, 2)], start_up()
@@ -390,7 +390,7 @@ def report(demos: int, shard_sizes: Sequence[int], few: int, published: Sequence
             yield from ("", "## opening", "", *opening_table(root, demos, shard_size))
             seconds = measured("plan", root)["wall"]
         yield from ("", "## cluster", "", *cluster_table(demos, shard_size, costs[0], start, seconds))
-        yield from ("", "## publishing", *publishing_table(published, shard_size, demos))
+    yield from ("", "## publishing", *publishing_table(publish_sizes, shard_sizes[0], demos))
 
 
 def main() -> None:
@@ -412,8 +412,8 @@ def main() -> None:
         print(json.dumps(publish(options.publish, options.shard_size[0])))
     else:
         os.environ["OMP_NUM_THREADS"] = "1"
-        few, published = (50, (10_000, 20_000)) if options.small else (300, (100_000, 400_000))
-        for line in report(options.demos, options.shard_size, few, published):
+        few, sizes = (50, (10_000, 20_000)) if options.small else (300, (200_000, 800_000))
+        for line in report(options.demos, options.shard_size, few, sizes):
             print(line, flush=True)
 
 

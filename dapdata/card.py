@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from dapdata.records import Array, columns, is_ragged
-from dapdata.split import SPLITS, UNUSED
+from dapdata.split import SPLITS, UNUSED, distinct
 
 LICENSE = "cc0-1.0"  # synthetic geometry, nobody's work: the data may be used for anything
 LICENSE_URL = "https://creativecommons.org/publicdomain/zero/1.0/"
@@ -190,12 +190,12 @@ def _splits(index: Mapping[str, Array]) -> str:
     owners = index["split"]
     names = [name for name in (*SPLITS, UNUSED) if name in owners]
     instances = [
-        {name: np.unique(index[kind][owners == name]) for name in names} for kind in ("container_instance", "object_instance")
+        {name: distinct(index[kind][owners == name]) for name in names} for kind in ("container_instance", "object_instance")
     ]
 
     def shared(own: str, found: Mapping[str, Array]) -> int:
         others = [found[name] for name in names if name not in (own, UNUSED)]
-        return len(np.intersect1d(found[own], np.concatenate([np.zeros(0, np.int64), *others])))
+        return len(np.intersect1d(found[own], distinct(np.concatenate([np.zeros(0, np.int64), *others])), assume_unique=True))
 
     lines = []
     for name in names:

@@ -33,10 +33,11 @@ if TYPE_CHECKING:
 
 State = Literal["ok", "note", "problem"]
 MARKS = {"ok": "ok", "note": "--", "problem": "!!"}
-INTERNAL = ("all", "dev", "docs")  # extras that no command needs by themselves
+INTERNAL = ("all", "dev", "docs", "interop")  # extras that no command needs by themselves
 GIVES = {
     "sim": "generate, label, run, eval, judge, show",
     "train": "train, eval, predict, run; .torch() and .stream() of a dataset",
+    "viz": "show --rerun",
     "ray": "--engine ray",
     "s3": "datasets in object stores",
 }

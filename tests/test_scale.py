@@ -258,6 +258,12 @@ def test_a_synthetic_dataset_opens_and_plans_like_a_true_one(scale: ModuleType, 
     ]
 
 
+def test_publishing_is_measured_on_units_that_it_accepts(scale: ModuleType) -> None:
+    found = scale.publish(40, 20)
+    assert found["cpu"] > 0
+    assert found["peak_mb"] > 50
+
+
 @pytest.mark.slow
 def test_ten_million_demos_open_in_two_seconds_and_a_gigabyte(scale: ModuleType, tmp_path: Path) -> None:
     """CPU seconds: other work on the machine is not at fault."""

@@ -30,7 +30,6 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import fields, is_dataclass, replace
 from functools import wraps
-from hashlib import sha256
 from pathlib import Path
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
@@ -190,7 +189,7 @@ class Kept:
         self.url = str(place)
         stack = ExitStack()
         self.root = stack.enter_context(working_copy(place, files=TABLES))
-        self._end = weakref.finalize(self, _end_of, os.getpid(), stack)
+        self._end = weakref.finalize(self, stack.close)
 
     @contextmanager
     def named(self) -> Iterator[None]:
@@ -201,11 +200,6 @@ class Kept:
     def __getstate__(self) -> dict[str, Any]:
         """Worker processes look where their parent keeps them."""
         return {"url": self.url, "root": self.root}
-
-
-def _end_of(process: int, stack: ExitStack) -> None:
-    if process == os.getpid():  # and not a fork of it
-        stack.close()
 
 
 # The copy --------------------------------------------------------------------------------------------------
@@ -229,9 +223,9 @@ class Copy:
         """Brings single files, all of one publication; where a name is nothing of ours, only the name."""
         for look in range(LOOKS):
             self._pull_manifest(names is None or MANIFEST in names)
-            wanted = self._single_files() if names is None else [*names]
-            wanted += [manifest.UNITS] if manifest.UNITS in self._manifest().get("files", {}) else []
-            self.folder.download((name for name in wanted if name != MANIFEST), self.root)
+            wanted = {*(self._single_files() if names is None else names)} - {MANIFEST}
+            wanted |= {manifest.UNITS} & self._manifest().get("files", {}).keys()  # where its units are listed
+            self.folder.download(sorted(wanted), self.root)
             if not self._is_torn():
                 break
             time.sleep(PAUSE if look + 1 < LOOKS else 0)
@@ -271,7 +265,7 @@ class Copy:
         """Whether a file is not the one that the manifest names: then both are read again, before that is called damage."""
         named = self._manifest().get("files", {})
         paths = [(self.root / str(name), digest) for name, digest in named.items() if is_inside(str(name))]
-        return any(path.is_file() and sha256(path.read_bytes()).hexdigest() != digest for path, digest in paths)
+        return any(path.is_file() and durable.hash_file(path) != digest for path, digest in paths)
 
     def _manifest(self) -> dict[str, Any]:
         """The manifest as far as it can be read; who needs it whole uses manifest.read."""
@@ -343,7 +337,7 @@ class Copy:
                 yield
             finally:
                 if log.exists() and log.read_bytes() != before:
-                    with suppress(EnvironmentProblem):  # it tells only how long things took
+                    with suppress(EnvironmentProblem):  # it tells only how long things took; of tasks, those of the last
                         self.folder.write(manifest.LOG, log.read_bytes())
 
     def commit(self, folder: Path) -> bool:
@@ -412,11 +406,15 @@ def _scratch() -> Iterator[Path]:
             if time.time() - os.fstat(file.fileno()).st_mtime > SETTLED:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 shutil.rmtree(left, ignore_errors=True)
-    with tempfile.TemporaryDirectory(prefix=SCRATCH) as top, Path(top, ALIVE).open("w") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
-        root = Path(top, "copy")
-        root.mkdir()
-        yield root
+    top, process = Path(tempfile.mkdtemp(prefix=SCRATCH)), os.getpid()
+    try:
+        with (top / ALIVE).open("w") as file:
+            fcntl.flock(file, fcntl.LOCK_EX)
+            (top / "copy").mkdir()
+            yield top / "copy"
+    finally:
+        if process == os.getpid():  # and not a fork of it, such as a DataLoader's worker
+            shutil.rmtree(top, ignore_errors=True)
 
 
 @contextmanager

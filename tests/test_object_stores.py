@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import gc
 import http.server
 import json
 import os
@@ -152,6 +153,13 @@ def test_torch_loaders_with_two_workers_read_from_a_bucket(bucket_toy: str, smal
         there = {int(sample["meta/demo"]): sample["container/points"].numpy() for sample in loader}
         assert there.keys() == here.keys()
         assert all(np.array_equal(there[demo], here[demo]) for demo in here)
+    child = os.fork()  # that lets go of the dataset, whose tables are its parent's
+    if child == 0:
+        del dataset, mapped, streamed, loader
+        gc.collect()
+        os._exit(0)
+    assert os.waitpid(child, 0)[1] == 0
+    assert len(dataset.index["positives"]) == len(here)
 
 
 def test_only_what_is_asked_for_is_read(bucket_toy: str, server: Server) -> None:

@@ -88,10 +88,7 @@ def staged(root: Path, name: str) -> Iterator[Path]:
 
 
 def commit(folder: Path, target: Path) -> bool:
-    """Moves a staged folder to its place for good; False if there is something already (then nothing is moved).
-
-    A single file may be moved too; it replaces one that has its name.
-    """
+    """Moves a staged folder, or file, to its place for good; see `move`."""
     if folder.is_file():
         _fsync(folder)
     for path, _, files in os.walk(folder, topdown=False):
@@ -99,6 +96,11 @@ def commit(folder: Path, target: Path) -> bool:
             _fsync(Path(path, file))
     for path, _, _ in os.walk(folder, topdown=False):
         _fsync(Path(path))
+    return move(folder, target)
+
+
+def move(folder: Path, target: Path) -> bool:
+    """Gives a folder, whose files are fsynced, its name for good; False if there is something already (then it stays)."""
     make_folder(target.parent)
     try:
         _rename(folder, target)

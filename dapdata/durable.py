@@ -127,6 +127,11 @@ def commit(folder: Path, target: Path) -> bool:
             _fsync(Path(path, file))
     for path, _, _ in os.walk(folder, topdown=False):
         _fsync(Path(path))
+    return move(folder, target)
+
+
+def move(folder: Path, target: Path) -> bool:
+    """Gives a folder, whose files are fsynced, its name for good; False if there is something already (then it stays)."""
     make_folder(target.parent)
     try:
         _rename(folder, target)

@@ -79,8 +79,9 @@ def choose(root: str | Path, split: str | None = None, demos: int | None = None)
 
     Raises:
         FormatError: if there is no labelled dataset.
-        UsageError: if there is no such split, or nothing in it.
+        UsageError: if there is no such split, or nothing in it, or `demos` is less than 1.
     """
+    _at_least_one("demos", demos)
     dataset = loading.open(root, split)
     owners = dataset.index["split"][:demos]
     if not len(owners):
@@ -89,8 +90,14 @@ def choose(root: str | Path, split: str | None = None, demos: int | None = None)
     return Chosen(dataset, {name: np.flatnonzero(owners == name) for name in order}, {"split": split, "demos": demos})
 
 
+def _at_least_one(name: str, value: int | None) -> None:
+    if value is not None and value < 1:
+        raise UsageError(f"{name}: got {value}, expected at least 1")
+
+
 def cut(chosen: Chosen, size: int) -> Iterator[tuple[str, list[Array]]]:
     """Each split with its demos in parts of `size`, the last one smaller."""
+    _at_least_one("shard_size", size)
     for name, numbers in chosen.splits.items():
         yield name, np.split(numbers, range(size, len(numbers), size))
 
@@ -285,6 +292,6 @@ def _finish(partial: Path, target: Path, about: Mapping[str, Any]) -> None:
     }
     text = json.dumps({**about, "files": files}, indent=1, sort_keys=True) + "\n"
     durable.replace_file(partial / ABOUT, text.encode())
-    if not durable.commit(partial, target):
+    if not durable.move(partial, target):  # every piece was fsynced when it was committed
         raise FormatError(f"{target}: was made by somebody else meanwhile, expected to be free; choose another with --out")
     (target / ".lock").unlink()

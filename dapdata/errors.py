@@ -8,7 +8,7 @@ DapdataError
 ├── CorruptionError (OSError)         3   bytes that are not what the manifest says; a judge that fails its oracle
 ├── QuarantineError (RuntimeError)    4   units that failed more often than they may
 ├── LockedError (OSError)             5   another process works on the dataset, or published it meanwhile
-└── EnvironmentProblem (RuntimeError) 6   disk full, no permission, a store that refuses
+└── EnvironmentProblem (RuntimeError) 6   disk full, no permission, a store or cluster that refuses
     └── MissingExtraError (ImportError) 6 an optional package is not installed
 
 Every message has four parts: where, what was found, what was expected, what to do.

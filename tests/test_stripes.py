@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import os
+import re
 import shlex
 import shutil
 import subprocess
@@ -10,6 +12,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import yaml
 from conftest import make_toy
 from toy_stages import toy_recipe
 
@@ -314,3 +317,61 @@ def test_an_array_task_without_its_number_says_so(
 @pytest.mark.parametrize(("limit", "code"), [("90", 0), ("2-00:00:00", 0), ("1:30:00", 0), ("4h", 2), ("", 2)])
 def test_a_time_limit_is_one_that_slurm_reads(limit: str, code: int, tiny_recipe: Path) -> None:
     assert cli.run_app(["slurm", str(tiny_recipe), "--time", limit]) == code
+
+
+# The page about clusters -----------------------------------------------------------------------------------
+
+PAGE = (Path(__file__).parents[1] / "docs/clusters.md").read_text(encoding="utf-8")
+
+
+def blocks(language: str) -> str:
+    return "\n".join(re.findall(rf"^```{language}\n(.*?)^```", PAGE, re.MULTILINE | re.DOTALL))
+
+
+def told() -> list[str]:
+    """Each command of dapdata that the page has people run, in its blocks and in its text."""
+    whole = "\n".join([blocks("sh"), *re.findall(r"`(dapdata (?:generate|label|slurm) [^`]+)`", PAGE)])
+    return re.findall(r"(dapdata (?:generate|label|slurm) [^\n&>]+)", whole)
+
+
+@pytest.fixture
+def beside_shared(tiny_dataset: Path, tiny_recipe: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A folder with the recipes and the datasets that the page speaks of."""
+    for name in ("recipes", "data", "shared"):
+        (tmp_path / name).mkdir()
+    for name in ("recipes/can_cabinet.yaml", "shared/can_cabinet.yaml"):
+        shutil.copy(tiny_recipe, tmp_path / name)
+    for name in ("data/can_cabinet", "shared/can_cabinet"):
+        (tmp_path / name).symlink_to(tiny_dataset)
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.mark.usefixtures("beside_shared")
+def test_the_commands_of_the_page_about_clusters_run_dry(capsys: pytest.CaptureFixture[str]) -> None:
+    lines = told()
+    assert len(lines) >= 12
+    for line in lines:
+        words = shlex.split(line.replace("/shared", "shared").replace("RECIPE", "recipes/can_cabinet.yaml"))[1:]
+        dry = [] if words[0] == "slurm" else ["--dry-run"]
+        assert cli.run_app([*words, *dry]) == 0, line
+    assert "sbatch --parsable" in capsys.readouterr().out
+
+
+@pytest.mark.usefixtures("beside_shared")
+def test_the_pod_of_the_page_about_clusters_makes_its_own_units(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    job = yaml.safe_load(blocks("yaml"))["spec"]
+    (container,) = job["template"]["spec"]["containers"]
+    mounted = {mount["name"] for mount in container["volumeMounts"]}
+    assert mounted == {volume["name"] for volume in job["template"]["spec"]["volumes"]}
+    (tmp_path / "bin").mkdir()
+    command = tmp_path / "bin/dapdata"
+    command.write_text(f'#!/bin/sh\nexec {sys.executable} -m dapdata "$@" --dry-run --json\n')
+    command.chmod(0o755)
+    text = container["args"][0].replace("/shared", "shared")
+    units = []
+    for index in ("0", "1", "2"):
+        environment = os.environ | {"PATH": f"{command.parent}:{os.environ['PATH']}", "JOB_COMPLETION_INDEX": index}
+        done = subprocess.run([*container["command"], text], env=environment, capture_output=True, text=True, check=True)
+        units.append(json.loads(done.stdout)["stages"][0]["units"])
+    assert units == [1, 1, 0], "two units, of five demos, in the first two of sixteen stripes"
+    assert f"/{job['completions']}" in text

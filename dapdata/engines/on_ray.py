@@ -51,7 +51,7 @@ class OnRay:
                     "start it and run the same command again"
                 ) from error
             finally:
-                for task in under_way:
+                for task in under_way if self._ray.is_initialized() else ():  # else `cancel` would look for a cluster
                     self._ray.cancel(task, force=True)
 
     def _outcomes(

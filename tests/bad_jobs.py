@@ -48,9 +48,10 @@ def behave(text: str) -> str:
     elif do == "closed pipe":
         os.closerange(3, 1000)
     elif do == "forking child":
-        if os.fork() == 0:
-            Path(job["note"]).write_text(str(os.getpid()))
+        process = os.fork()
+        if process == 0:
             time.sleep(1000)
+        Path(job["note"]).write_text(str(process))
     elif do == "note and hang":
         Path(job["note"]).write_text(str(os.getpid()))
         time.sleep(1000)

@@ -34,7 +34,8 @@ def content(root: Path) -> str:
 def own_ray(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """A folder of Ray in which nobody else's cluster is found; workers find our modules."""
     with tempfile.TemporaryDirectory(prefix="r", dir="/tmp") as folder:  # Ray's sockets need a short path
-        monkeypatch.delenv("RAY_ADDRESS", raising=False)
+        for name in ("RAY_ADDRESS", "RAY_AUTH_MODE"):
+            monkeypatch.delenv(name, raising=False)
         monkeypatch.setenv("RAY_TMPDIR", folder)
         monkeypatch.setenv("HOME", folder)  # where Ray keeps the token of the clusters that it starts
         monkeypatch.setenv("PYTHONPATH", f"{HERE}:{os.environ.get('PYTHONPATH', '')}")
@@ -54,6 +55,21 @@ def test_a_cluster_whose_worker_is_killed_ends_with_the_content_of_a_serial_run(
     pipeline.label(root, engine="inline", table=TABLE)
     assert content(root) == content(toy)
     assert health.verify(root).ok
+
+
+def test_a_cluster_that_does_not_start_is_an_error_that_says_so(own_ray: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import ray
+
+    def slow(*_: object, **__: object) -> None:
+        os.environ["RAY_AUTH_MODE"] = "token"  # as Ray does
+        raise Exception("The current node timed out during startup.")
+
+    monkeypatch.setattr(ray, "init", slow)
+    with pytest.raises(
+        EnvironmentProblem, match=r"ray: no Ray cluster could be joined or started \(The current node timed out"
+    ):
+        engines.get("ray").run("bad_jobs:behave", [engines.Job("{}", 1)], workers=1, on_done=print)
+    assert "RAY_AUTH_MODE" not in os.environ
 
 
 @pytest.mark.parametrize("name", ["ray", "ray://127.0.0.1:1", "ray://nowhere.invalid:10001"])

@@ -107,7 +107,8 @@ def _connected(ray: ModuleType, name: str, workers: int | None) -> Iterator[None
             if address != LOCAL and address != RUNNING:
                 _knock(address)
             ray.init(address, **quiet, **mine)
-        except (OSError, RuntimeError, ValueError) as error:
+        except Exception as error:  # of every kind, also bare: a node that is slow to start, another version, no token
+            ray.shutdown()
             raise EnvironmentProblem(
                 f"{name}: no Ray cluster could be joined or started ({_lines(error)[0]}); expected one of the same Ray and "
                 "Python, and its token if it wants one (RAY_AUTH_MODE=token)"

@@ -29,7 +29,7 @@ class Form:
 
     files: str  # Markdown: what is where
     loader: str  # Markdown: how to read it
-    configs: str = ""  # YAML, the value of `configs` in the header: which files the viewer shows
+    header: str = ""  # YAML: which files the hub's viewer shows
     has_arrays: bool = True  # whether the files hold the shards' arrays
 
 
@@ -50,7 +50,7 @@ xyz, score = (g[f"container_superpoints/{k}"][o[i]:o[i+1]] for k in ("points", "
 
 or, with dapdata installed, `dapdata.open(".", split="train")[0]`, and `.torch()` or `.stream()` of it for training.
 """,
-    configs="- config_name: index\n  data_files: index.parquet",
+    header="configs:\n- config_name: index\n  data_files: index.parquet",
 )
 
 FRAMES = """## Units and frames
@@ -103,7 +103,7 @@ def render(
         f"# {manifest['name']}\n\n{summary(manifest, demos, _here(index))}\n",
         "".join(f"![{_alt(path)}]({path})\n" for path in previews),
         *([f"## Read it\n\n{form.loader}", _averages(index), _splits(index)] if index else [UNLABELLED]),
-        _rejects(manifest["rejects"]),
+        _rejects(manifest["rejects"], manifest["missing"]),
         FRAMES,
         f"## Files\n\n{form.files}\n",
         *([f"## Arrays\n\n{_table(ARRAYS_HEAD, _arrays())}"] if form.has_arrays else []),
@@ -161,7 +161,7 @@ def _header(manifest: Mapping[str, Any], index: Mapping[str, Array], form: Form)
     size = next((text for limit, text in SIZES if here < limit), "n>1M")
     lines = [f"license: {LICENSE}", "task_categories:", "- robotics", "tags:", *(f"- {tag}" for tag in TAGS)]
     lines += [f"pretty_name: {manifest['name']}", "size_categories:", f"- {size}"]
-    lines += ["configs:", form.configs] if index and form.configs else []
+    lines += [form.header] if index and form.header else []
     return "\n".join(["---", *lines, "---"])
 
 
@@ -210,13 +210,16 @@ def _splits(index: Mapping[str, Array]) -> str:
     return f"## Splits\n\n{_table(head, lines)}\n{proof}{spare}\n"
 
 
-def _rejects(rejects: Mapping[str, Mapping[str, int]]) -> str:
+def _rejects(rejects: Mapping[str, Mapping[str, int]], missing: Sequence[Mapping[str, Any]]) -> str:
     words = {
         "attempts": "scenes given up (another was drawn instead)",
         "demos": "demos left out",
         "goals": "candidate goals that did not hold (kept in `rejected_goals/`)",
     }
     lines = [(words[what], reason, count) for what, counts in rejects.items() for reason, count in counts.items()]
+    for entry in missing:
+        start, stop = entry["demo_range"]
+        lines.append((f"demos {start} to {stop - 1}, which could not be made", entry["reason"].replace("|", "/"), stop - start))
     return "## What was rejected\n\n" + (_table(["what", "reason", "count"], lines) if lines else "Nothing.\n")
 
 

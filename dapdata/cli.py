@@ -49,10 +49,12 @@ def _option(*names: str, help: str, default: str = "", **more: Any) -> Any:
     return typer.Option(*names, help=words, show_default=False, **more)
 
 
-LastDataset = Annotated[Path | None, typer.Argument(help="Dataset folder; default: the last one written from here.")]
+LastDataset = Annotated[str | None, typer.Argument(help="Dataset folder or URL; default: the last one written from here.")]
 LastRun = Annotated[Path | None, typer.Argument(help="Run folder; default: the last one written from here.")]
 RecipeFile = Annotated[Path, typer.Argument(help="Recipe, such as recipes/quickstart.yaml.")]
-Out = Annotated[Path | None, _option("--out", help="Dataset folder", default="data/<recipe name>", metavar="DIR")]
+Out = Annotated[
+    str | None, _option("--out", help="Dataset folder, or s3://bucket/folder", default="data/<recipe name>", metavar="DIR")
+]
 RunFolder = Annotated[Path | None, _option("--run", help="Run folder", default="runs/<dataset name>", metavar="DIR")]
 Demos = Annotated[int | None, _option("--demos", help="Number of demos", default="the recipe's", min=1, metavar="N")]
 Overrides = Annotated[list[str] | None, _option("--set", help="Override of a recipe key; may be repeated", metavar="KEY=VALUE")]
@@ -64,7 +66,33 @@ Workers = Annotated[
     _option("--workers", help="Processes that work at the same time", default="one for each core", min=1, metavar="W"),
 ]
 Engine = Annotated[
-    str, typer.Option("--engine", help="Where they work: local, or inline: in this process, one after the other.")
+    str,
+    typer.Option(
+        "--engine",
+        help="Where they work: local; ray, or ray://HOST:PORT, on a Ray cluster; inline: in this process, one after the other.",
+    ),
+]
+Memory = Annotated[
+    float | None,
+    _option(
+        "--memory",
+        help="Memory that each of them may take; a unit that takes more has failed",
+        default="an equal part of 80 % of what there is",
+        min=0.1,
+        metavar="GB",
+    ),
+]
+Units = Annotated[
+    str | None,
+    _option(
+        "--units",
+        help="Make every N-th unit, from the I-th on (from 0); other tasks make the others at the same time",
+        default="all units",
+        metavar="I/N",
+    ),
+]
+AllowMissing = Annotated[
+    bool, typer.Option("--allow-missing", help="Publish the others when units have failed; the manifest names what is missing.")
 ]
 Device = Annotated[str, typer.Option("--device", help="auto, cpu, cuda or cuda:N.")]
 Minutes = Annotated[
@@ -184,6 +212,9 @@ def generate(
     demos: Demos = None,
     workers: Workers = None,
     engine: Engine = "local",
+    memory: Memory = None,
+    units: Units = None,
+    allow_missing: AllowMissing = False,
     overrides: Overrides = None,
     dry_run: DryRun = False,
     fresh: Fresh = False,
@@ -197,13 +228,16 @@ def generate(
         made = pipeline.generate(
             asked,
             out,
-            workers=_count(workers),
+            workers=workers,
             engine=engine,
+            memory=memory,
+            units=units,
+            allow_missing=allow_missing,
             fresh=fresh,
             dry_run=dry_run,
             progress=None if dry_run else advance,
         )
-    _show_made(made, as_json)
+    _show_made(made, as_json, units)
 
 
 @app.command(epilog="Example: dapdata label data/can_cabinet --set label.eps_place=0.02")
@@ -211,6 +245,9 @@ def label(
     dataset: LastDataset = None,
     workers: Workers = None,
     engine: Engine = "local",
+    memory: Memory = None,
+    units: Units = None,
+    allow_missing: AllowMissing = False,
     overrides: Overrides = None,
     dry_run: DryRun = False,
     as_json: Json = False,
@@ -223,14 +260,43 @@ def label(
         made = pipeline.label(
             folder,
             overrides or (),
-            workers=_count(workers),
+            workers=workers,
             engine=engine,
+            memory=memory,
+            units=units,
+            allow_missing=allow_missing,
             dry_run=dry_run,
             progress=None if dry_run else advance,
         )
-    if isinstance(made, Path):
+    if not dry_run and units is None:  # pictures need the dataset's lock, which tasks share
         _draw_previews(made)
-    _show_made(made, as_json)
+    _show_made(made, as_json, units)
+
+
+@app.command(epilog="Example: dapdata slurm recipes/can_cabinet.yaml --tasks 20 > can_cabinet.sh; bash can_cabinet.sh")
+def slurm(
+    recipe: RecipeFile,
+    out: Out = None,
+    demos: Demos = None,
+    tasks: Annotated[
+        int | None,
+        _option("--tasks", help="Most tasks of an array job", default="100, or one for each unit", min=1, metavar="N"),
+    ] = None,
+    workers: Annotated[int, typer.Option("--workers", help="Cores and processes of each task.", min=1, metavar="W")] = 1,
+    memory: Annotated[float, typer.Option("--memory", help="Memory of each process.", min=0.5, metavar="GB")] = 2.0,
+    time: Annotated[str, typer.Option("--time", help="Time limit of each task.", metavar="HH:MM:SS")] = "04:00:00",
+    partition: Annotated[str | None, _option("--partition", help="Partition", default="the cluster's", metavar="P")] = None,
+    account: Annotated[str | None, _option("--account", help="Account", default="yours", metavar="A")] = None,
+    overrides: Overrides = None,
+    allow_missing: AllowMissing = False,
+) -> None:
+    """Print a script that submits generate and label to Slurm as array jobs. Nothing is submitted by this command."""
+    from dapdata.slurm import Limits, script
+
+    asked = _recipe(recipe, overrides, demos)
+    changes = [*(overrides or ()), *([f"demos={demos}"] if demos is not None else [])]
+    limits = Limits(tasks, workers, memory, time, partition, account)
+    print(script(asked, recipe, out, changes, limits, allow_missing), end="")
 
 
 @app.command(epilog="Example: dapdata status data/can_cabinet --json")
@@ -298,7 +364,7 @@ def show_dataset(
         shown = show_rerun(folder, out, demo, count)
         show({"files": [str(shown)] if shown else []}, as_json, str(shown or "shown in the rerun viewer"))
         return
-    targets = [out] if out is not None else [Path(f"{folder.resolve().name}{suffix}") for suffix in (".png", ".html")]
+    targets = [out] if out is not None else [Path(f"{_name(folder)}{suffix}") for suffix in (".png", ".html")]
     if any(target.suffix not in (".png", ".html") for target in targets):
         raise UsageError(f"--out {out}: expected a .png or .html file")
     draw = {".png": contact_sheet, ".html": show_html}
@@ -322,14 +388,14 @@ def train(
     as_json: Json = False,
 ) -> None:
     """Train on the train split. Goes on where it stopped; keeps the best (held-out) and the last weights."""
-    from dapdata import manifest, recipe
+    from dapdata import loading, manifest, recipe
     from daptrain import train as train_networks
 
     folder = last("dataset", dataset)
     _train_keys(overrides)
-    about = manifest.read(folder)
-    config = recipe.from_resolved(about.recipe, overrides or (), str(folder / manifest.MANIFEST)).train
-    target = run or Path("runs") / folder.resolve().name
+    resolved = loading.open(folder).recipe
+    config = recipe.from_resolved(resolved, overrides or (), f"{folder}/{manifest.MANIFEST}").train
+    target = run or Path("runs") / _name(folder)
     train_networks(folder, target, net=net, minutes=minutes, steps=steps, device=device, config=config, method=method)
     remember(dataset=folder, run=target)
     show({"run": str(target), "dataset": str(folder)}, as_json, str(target))
@@ -338,7 +404,9 @@ def train(
 @app.command("eval", epilog="Example: dapdata eval runs/can_cabinet --trials 50 -k 8")
 def evaluate(
     run: LastRun = None,
-    data: Annotated[Path | None, _option("--data", help="Dataset folder", default="the run's own", metavar="DATASET")] = None,
+    data: Annotated[
+        str | None, _option("--data", help="Dataset folder or URL", default="the run's own", metavar="DATASET")
+    ] = None,
     split: InSplit = "test",
     trials: Trials = None,
     protocol: Rules = None,
@@ -386,7 +454,7 @@ def evaluate(
     if minutes is not None or steps is not None:
         raise UsageError("--minutes, --steps: nothing is trained without --curve; train with: dapdata train")
     if method in (None, "dap", "cap"):
-        run = last("run", run)
+        run = Path(last("run", run))
         method = method or str(read_description(run)["method"])
     elif run is not None:  # a report of another method must not replace the run's own
         out = out or run.parent / f"{method}-{run.name}"
@@ -402,7 +470,7 @@ def evaluate(
 @app.command(epilog="Example: dapdata judge mine.npz --data data/can_cabinet --out mine.json")
 def judge(
     predictions: Annotated[Path, typer.Argument(help="npz with demo, rank, T_world_object and score.")],
-    data: Annotated[Path, _option("--data", help="Dataset folder", metavar="DATASET")],
+    data: Annotated[str, _option("--data", help="Dataset folder or URL", metavar="DATASET")],
     split: InSplit = "test",
     trials: Annotated[int | None, _option("--trials", help="Demos of the split that are judged", default="all", min=1)] = None,
     protocol: Annotated[Protocol, typer.Option("--protocol", help="Rules of the judge.")] = "strict",
@@ -489,6 +557,8 @@ def run(
     k: K = None,
     workers: Workers = None,
     engine: Engine = "local",
+    memory: Memory = None,
+    allow_missing: AllowMissing = False,
     device: Device = "auto",
     overrides: Overrides = None,
     fresh: Fresh = False,
@@ -497,7 +567,7 @@ def run(
     """Generate, label, train and eval. Then say how well it went and where everything is."""
     from dapdata import pipeline
 
-    _need("sim", "pybullet", "numba", "pebble", "matplotlib")
+    _need("sim", "pybullet", "numba", "matplotlib")
     _need("train", "torch")
     from daptrain import evaluate as evaluate_run
     from daptrain import train as train_networks
@@ -505,21 +575,22 @@ def run(
 
     check_budget(minutes, None)
     asked = _recipe(recipe, overrides, demos)
+    means: dict[str, Any] = {"workers": workers, "engine": engine, "memory": memory, "allow_missing": allow_missing}
     with progress("generate", "demo") as advance:
-        dataset = _folder(pipeline.generate(asked, out, workers=_count(workers), engine=engine, fresh=fresh, progress=advance))
+        dataset = str(pipeline.generate(asked, out, fresh=fresh, progress=advance, **means))
     with progress("label", "demo") as advance:
-        pipeline.label(dataset, workers=_count(workers), engine=engine, progress=advance)
+        pipeline.label(dataset, progress=advance, **means)
     _draw_previews(dataset)
     remember(dataset=dataset)
-    target = run_folder or Path("runs") / dataset.resolve().name
+    target = run_folder or Path("runs") / _name(dataset)
     if fresh and (target / "config.json").is_file():
         shutil.rmtree(target)
     train_networks(dataset, target, minutes=minutes, device=device, config=asked.train)
     remember(run=target)
     report = evaluate_run(target, dataset, trials=trials, k=k, device=device, workers=_count(workers))
     files = {"dataset": dataset, "run": target, "report": target / "report.html"} | _leave_behind(dataset, target)
-    made = {name: str(path) for name, path in files.items()}
-    show({**made, "result": report}, as_json, made_text(report, made))
+    left = {name: str(path) for name, path in files.items()}
+    show({**left, "result": report}, as_json, made_text(report, left))
 
 
 # Other formats ---------------------------------------------------------------------------------------------
@@ -584,7 +655,7 @@ def export_scenes(
     _export("scenes", dataset, out, as_json, split=split, demos=demos)
 
 
-def _export(kind: str, dataset: Path | None, out: Path, as_json: bool, **options: Any) -> None:
+def _export(kind: str, dataset: str | None, out: Path, as_json: bool, **options: Any) -> None:
     """Runs one export; options that were not given are the format's own."""
     from importlib import import_module
 
@@ -661,7 +732,7 @@ def _train_keys(overrides: list[str] | None) -> dict[str, Any]:
 def _evaluate_curve(
     sizes: str,
     run: Path | None,
-    data: Path | None,
+    data: str | None,
     out: Path | None,
     overrides: list[str] | None,
     method: str | None,
@@ -669,7 +740,7 @@ def _evaluate_curve(
     asked: dict[str, Any],
 ) -> None:
     """`dapdata eval --curve`; `asked` are further arguments of `daptrain.curve.curve`."""
-    from dapdata import manifest, recipe
+    from dapdata import loading, manifest, recipe
     from daptrain.checkpoint import read_description
     from daptrain.curve import curve, text
     from daptrain.evaluation import data_of
@@ -678,12 +749,12 @@ def _evaluate_curve(
     if not all(number.isdecimal() for number in numbers):
         raise UsageError(f"--curve: got '{sizes}', expected numbers of demos with commas between them, such as 10,20,40")
     description = {} if run is None else read_description(run)
-    folder = data or (last("dataset", None) if run is None else Path(data_of(run)))
+    folder = data or (last("dataset", None) if run is None else str(data_of(run)))
     _train_keys(overrides)
-    resolved = manifest.read(folder).recipe | ({"train": description["train"]} if description else {})
-    config = recipe.from_resolved(resolved, overrides or (), str(run or folder / manifest.MANIFEST)).train
+    resolved = loading.open(folder).recipe | ({"train": description["train"]} if description else {})
+    config = recipe.from_resolved(resolved, overrides or (), str(run or f"{folder}/{manifest.MANIFEST}")).train
     method = method or str(description.get("method", "dap"))
-    target = out or run or Path("runs") / f"curve-{folder.resolve().name}"
+    target = out or run or Path("runs") / f"curve-{_name(folder)}"
     found = curve(folder, target, [int(number) for number in numbers], config=config, method=method, **asked)
     remember(dataset=folder)
     show(found, as_json, f"{text(found)}\n\n{target / 'curve.html'}")
@@ -694,27 +765,28 @@ def _count(workers: int | None) -> int:
     return workers or len(os.sched_getaffinity(0))
 
 
-def _draw_previews(dataset: Path) -> None:
+def _draw_previews(dataset: Any) -> None:
     """Adds the pictures of the dataset's card, unless they are there already."""
-    from dapdata import manifest, pipeline
+    from dapdata import loading, manifest, pipeline
     from dapdata.show import preview
 
-    if not any(path.startswith(f"{manifest.PREVIEWS}/") for path in manifest.read(dataset).files):
+    if not any(path.startswith(f"{manifest.PREVIEWS}/") for path in loading.open(dataset).manifest.files):
         pipeline.attach(dataset, preview(dataset))
 
 
-def _show_made(made: Any, as_json: bool) -> None:
-    """Shows the dataset's folder, or the plan."""
-    if isinstance(made, Path):
-        remember(dataset=made)
+def _show_made(made: Any, as_json: bool, units: str | None) -> None:
+    """Shows the dataset's folder or URL, or the plan."""
+    if isinstance(made, str | Path):
+        if units is None:
+            remember(dataset=made)
         show({"dataset": str(made)}, as_json, str(made))
     else:
         show(made.to_dict(), as_json, str(made))
 
 
-def _folder(made: Any) -> Path:
-    assert isinstance(made, Path), "only a dry run makes a plan"
-    return made
+def _name(dataset: str) -> str:
+    """The last part of a dataset's folder or URL."""
+    return Path(dataset).resolve().name
 
 
 def _show_report(report: dict[str, Any], as_json: bool) -> None:
@@ -726,7 +798,7 @@ def _show_report(report: dict[str, Any], as_json: bool) -> None:
     require_sound(Report.model_validate_json(json.dumps(report)))
 
 
-def _leave_behind(dataset: Path, run: Path) -> dict[str, Path]:
+def _leave_behind(dataset: str, run: Path) -> dict[str, Path]:
     """Pictures of the dataset, and the clouds of one held-out demo as scans to try `dapdata predict` on."""
     from dapdata.clouds import write_ply
     from dapdata.loading import open as open_dataset

@@ -81,7 +81,7 @@ class _Lines:
 # What was last written from this folder --------------------------------------------------------------------
 
 
-def remember(**folders: Path) -> None:
+def remember(**folders: Path | str) -> None:
     """Notes datasets and runs by kind, so that the next command needs no argument."""
     try:
         LAST.parent.mkdir(exist_ok=True)
@@ -92,20 +92,20 @@ def remember(**folders: Path) -> None:
         say(f"{LAST}: not written ({error.strerror}); the next command needs its dataset or run as an argument")
 
 
-def last(kind: Literal["dataset", "run"], given: Path | None) -> Path:
-    """The folder that was given; or else the one last written from here, which is then said.
+def last(kind: Literal["dataset", "run"], given: Path | str | None) -> str:
+    """The folder (of a dataset also the URL) that was given; or else the one last written from here, which is then said.
 
     Raises:
         UsageError: if there is neither.
     """
     if given is not None:
-        return given
+        return str(given)
     folder = _recall().get(kind)
     if folder is None:
         make = "dapdata generate RECIPE" if kind == "dataset" else "dapdata train"
         raise UsageError(f"{kind}: none was given and none was written from this folder yet; name one, or run: {make}")
     say(f"{kind}: {folder} (the last one written from this folder)")
-    return Path(folder)
+    return folder
 
 
 def _recall() -> dict[str, str]:

@@ -4,6 +4,9 @@ Everything that is published goes through here, in this order: write in `staging
 folders from the leaves up, rename, fsync the folder that holds the new name. A reader or a crash therefore sees
 a committed folder whole or not at all. zarr writes its chunks by rename too, but never fsyncs, and reads a
 missing chunk as fill values without a word; hence a whole unit is committed at once and named by its hashes.
+
+A dataset in an object store is worked on in a copy on this machine (remote.py). What is made durable in the copy is
+repeated in the store by the copy's `Mirror`, so there is one order of steps for both.
 """
 
 from __future__ import annotations
@@ -16,11 +19,12 @@ import shutil
 import socket
 import sys
 import tempfile
+import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from hashlib import file_digest, sha256
 from pathlib import Path
-from typing import Any
+from typing import IO, Any, Protocol
 
 from dapdata.errors import EnvironmentProblem, LockedError
 
@@ -30,6 +34,30 @@ FULL_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 NO_PERMISSION = (errno.EACCES, errno.EPERM, errno.EROFS)
 
 observer: Callable[[str, Path], None] | None = None  # tests set it to see, or to stop at, every fsync and rename
+
+
+class Mirror(Protocol):
+    """Repeats elsewhere what is made durable below a folder of this machine."""
+
+    def hold(self, shared: bool, deadline: float) -> AbstractContextManager[None]:
+        """Keeps other writers away there, as `lock` does here; brings here what they have done until now."""
+
+    def commit(self, folder: Path) -> bool:
+        """A folder was moved to its place here; False if there is another there already, which is then here too."""
+
+    def replace(self, path: Path) -> None:
+        """A file has new bytes."""
+
+    def remove(self, path: Path) -> None:
+        """A file or a folder is to go."""
+
+
+mirrors: dict[Path, Mirror] = {}  # by folder; empty unless a dataset in an object store is worked on
+
+
+def mirror_of(path: Path) -> Mirror | None:
+    """The mirror of the working copy that a path is in."""
+    return next((mirror for root, mirror in mirrors.items() if path.is_relative_to(root)), None)
 
 
 def _note(action: str, path: Path) -> None:
@@ -88,7 +116,7 @@ def staged(root: Path, name: str) -> Iterator[Path]:
 
 
 def commit(folder: Path, target: Path) -> bool:
-    """Moves a staged folder to its place for good; False if there is something already (then nothing is moved).
+    """Moves a staged folder to its place for good; False if there is something already (then nothing is changed).
 
     A single file may be moved too; it replaces one that has its name.
     """
@@ -99,6 +127,11 @@ def commit(folder: Path, target: Path) -> bool:
             _fsync(Path(path, file))
     for path, _, _ in os.walk(folder, topdown=False):
         _fsync(Path(path))
+    return move(folder, target)
+
+
+def move(folder: Path, target: Path) -> bool:
+    """Gives a folder, whose files are fsynced, its name for good; False if there is something already (then it stays)."""
     make_folder(target.parent)
     try:
         _rename(folder, target)
@@ -107,13 +140,14 @@ def commit(folder: Path, target: Path) -> bool:
             return False
         raise
     _fsync(target.parent)
-    return True
+    mirror = mirror_of(target)
+    return mirror is None or mirror.commit(target)
 
 
 def replace_file(path: Path, data: bytes) -> None:
     """Writes a file so that its name holds either the old bytes or the new ones, also after a power cut."""
     make_folder(path.parent)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    temporary = path.with_name(f".{path.name}.{socket.gethostname()}.{os.getpid()}.tmp")
     temporary.write_bytes(data)
     move_file(temporary, path)
 
@@ -124,10 +158,14 @@ def move_file(source: Path, target: Path) -> None:
     _fsync(source)
     _rename(source, target)
     _fsync(target.parent)
+    if mirror := mirror_of(target):
+        mirror.replace(target)
 
 
 def remove_file(path: Path) -> None:
     """Takes a name away for good; a name that isn't there is fine."""
+    if mirror := mirror_of(path):
+        mirror.remove(path)
     if path.exists():
         _note("remove", path)
         path.unlink()
@@ -136,6 +174,8 @@ def remove_file(path: Path) -> None:
 
 def discard(root: Path, path: Path) -> None:
     """Deletes a folder so that a crash leaves it whole or gone: it is renamed into staging first."""
+    if mirror := mirror_of(path):
+        mirror.remove(path)
     make_folder(root / STAGING)
     grave = Path(tempfile.mkdtemp(prefix="discarded-", dir=root / STAGING))
     _rename(path, grave / path.name)
@@ -144,45 +184,89 @@ def discard(root: Path, path: Path) -> None:
 
 
 def sweep(root: Path) -> None:
-    """Removes what killed processes left in staging and half-written names; only under the lock."""
-    shutil.rmtree(root / STAGING, ignore_errors=True)
+    """Removes what killed processes left in staging and half-written names; only under a lock that nobody shares.
+
+    Staging is renamed first: a worker that has not heard yet of its command's end (on another machine it may go on for
+    some seconds) then fails, instead of committing a folder that is half swept.
+    """
+    with suppress(FileNotFoundError):
+        (root / STAGING).rename(root / f".{STAGING}.{socket.gethostname()}.{os.getpid()}.tmp")
     for leftover in [*root.glob(TEMPORARY), *root.glob(f"*/{TEMPORARY}")]:
-        leftover.unlink()
+        if leftover.is_dir():
+            shutil.rmtree(leftover, ignore_errors=True)
+        else:
+            leftover.unlink()
+
+
+def this_process() -> str:
+    """How a holder of a lock is named to others."""
+    return f"process {os.getpid()} on {socket.gethostname()} ({' '.join(sys.argv)[:200]})"
 
 
 @contextmanager
-def lock(root: Path) -> Iterator[None]:
-    """Holds the dataset for one writer; readers need no lock. The lock dies with its process.
+def lock(root: Path, *, shared: bool = False, patience: float = 0.0) -> Iterator[None]:
+    """Holds the dataset for one writer, or for several that share it; readers need no lock. It dies with its process.
+
+    Those who share it may commit units, which is a rename each and harmless if two make the same one. They neither
+    sweep nor publish.
+
+    Args:
+        root: The dataset's folder.
+        shared: Whether others may hold it at the same time, if they share it too.
+        patience: How long to wait for it, s.
 
     Raises:
-        LockedError: at once, if another process holds it; the message says which.
+        LockedError: if another process holds it; the message says which.
     """
     make_folder(root)
     with (root / ".lock").open("a+") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            file.seek(0)
-            holder = file.read().strip() or "another process"
-            raise LockedError(f"{root}: in use by {holder}; wait for it to end, or stop it, and run again") from error
-        file.truncate(0)
-        file.write(f"process {os.getpid()} on {socket.gethostname()} ({' '.join(sys.argv)[:200]})")
-        file.flush()
-        sweep(root)
-        try:
-            yield
-        finally:
-            sweep(root)
+        deadline = time.monotonic() + patience
+        _flock(root, file, fcntl.LOCK_SH if shared else fcntl.LOCK_EX, deadline)
+        mine = f"{this_process()}\n"
+        if not shared:
             file.truncate(0)
+            sweep(root)
+        file.write(mine)
+        file.flush()
+        mirror = mirror_of(root)
+        try:
+            with mirror.hold(shared, deadline) if mirror else nullcontext():
+                yield
+        finally:
+            if not shared:
+                sweep(root)
+            file.seek(0)
+            others = file.read().replace(mine, "", 1) if shared else ""
+            file.truncate(0)
+            file.write(others)
+
+
+def _flock(root: Path, file: IO[str], kind: int, deadline: float) -> None:
+    while True:
+        try:
+            fcntl.flock(file, kind | fcntl.LOCK_NB)
+            return
+        except OSError as error:
+            if error.errno not in (errno.EAGAIN, errno.EACCES):
+                raise EnvironmentProblem(
+                    f"{root}: cannot be locked ({error.strerror}), expected a file system with flock (Lustre: mounted with "
+                    "`flock`); choose another folder with --out"
+                ) from error
+            if time.monotonic() >= deadline:
+                found = holder(root) or "another process"
+                raise LockedError(f"{root}: in use by {found}; wait for it to end, or stop it, and run again") from error
+        time.sleep(0.1)
 
 
 def holder(root: Path) -> str | None:
-    """Who works on the dataset now, as it said itself; None if nobody does."""
+    """Who works on the dataset now, as it said itself; None if nobody does. Those on other machines are believed."""
     try:
-        words = (root / ".lock").read_text()
+        lines = (root / ".lock").read_text().splitlines()
     except OSError:
         return None
-    return words if words and Path("/proc", words.split()[1]).exists() else None
+    here = f" on {socket.gethostname()} ("
+    working = [line for line in lines if here not in line or Path("/proc", line.split()[1]).exists()]
+    return f"{working[0]} and {len(working) - 1} more" if len(working) > 1 else next(iter(working), None)
 
 
 @contextmanager

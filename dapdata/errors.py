@@ -7,8 +7,8 @@ DapdataError
 │   └── CheckpointError               2   weights of another task or another network
 ├── CorruptionError (OSError)         3   bytes that are not what the manifest says; a judge that fails its oracle
 ├── QuarantineError (RuntimeError)    4   units that failed more often than they may
-├── LockedError (OSError)             5   another process works on the dataset
-└── EnvironmentProblem (RuntimeError) 6   disk full, no permission
+├── LockedError (OSError)             5   another process works on the dataset, or published it meanwhile
+└── EnvironmentProblem (RuntimeError) 6   disk full, no permission, a store or cluster that refuses
     └── MissingExtraError (ImportError) 6 an optional package is not installed
 
 Every message has four parts: where, what was found, what was expected, what to do.
@@ -65,7 +65,7 @@ class LockedError(DapdataError, OSError):
 
 
 class EnvironmentProblem(DapdataError, RuntimeError):
-    """The machine, not the input, is at fault: disk full, no permission, package missing."""
+    """The machine or the store, not the input, is at fault: disk full, no permission, no bucket, package missing."""
 
     exit_code = 6
 

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from dapdata import durable, manifest, store
+from dapdata import durable, manifest, remote, store
 from dapdata.errors import CorruptionError, FormatError
 from dapdata.manifest import Manifest, UnitEntry
 from dapdata.split import SPLITS, distinct
@@ -93,11 +93,12 @@ class Audit:
         return "\n".join([head, *(f"  {line}" for line in self.problems), *(f"  note: {line}" for line in self.notes)])
 
 
+@remote.on_copy(units=True, leftovers=True)
 def verify(root: str | Path, *, quick: bool = False, progress: Progress | None = None) -> Audit:
     """Compares a dataset with its manifest, down to each decoded demo.
 
     Args:
-        root: The dataset's folder.
+        root: The dataset's folder or URL.
         quick: Compare files with their hashes, and leave the arrays undecoded.
         progress: Called with units done and units in all.
 
@@ -112,12 +113,13 @@ def verify(root: str | Path, *, quick: bool = False, progress: Progress | None =
     total = len(found.shards) if is_slim else sum(len(stage.units) for stage in found.stages.values())
     try:
         for done, (entry, is_shard) in enumerate(_units(found, is_slim), 1):
-            record, damage = _unit_files(root, entry)
-            files += len(record["files"]) if record else 0
-            problems += damage
-            if is_shard and record and not damage:
-                claims.see(entry.path, record)
-                problems += [] if quick else list(_decoded(root, entry, record))
+            with remote.filled(root / entry.path):
+                record, damage = _unit_files(root, entry)
+                files += len(record["files"]) if record else 0
+                problems += damage
+                if is_shard and record and not damage:
+                    claims.see(entry.path, record)
+                    problems += [] if quick else list(_decoded(root, entry, record))
             if progress:
                 progress(done, total)
         notes = list(_notes(root, found))
@@ -274,6 +276,9 @@ def _leaks(index: Index, found: Manifest) -> Iterator[str]:
 def _notes(root: Path, found: Manifest) -> Iterator[str]:
     if _is_slim(root, found):
         yield "stages/ is not here: the shards are complete in themselves, but cannot be labelled again"
+    for entry in found.missing:
+        first, last = entry.demo_range[0], entry.demo_range[1] - 1
+        yield f"demos {first} to {last} are missing: {entry.stage} failed: {entry.reason}; run generate and label to try again"
     unnamed = _unnamed(root, found)
     if unnamed:
         size = sum(_size(path) for path in unnamed)
@@ -283,6 +288,7 @@ def _notes(root: Path, found: Manifest) -> Iterator[str]:
 # How far, what is inside, what may go ----------------------------------------------------------------------
 
 
+@remote.on_copy(units=True)
 def status(root: str | Path) -> Facts:
     """How far a dataset is: units made of each stage, whether a command is at work, what it cost so far."""
     root = Path(root)
@@ -305,7 +311,7 @@ def status(root: str | Path) -> Facts:
     facts = {
         "root": str(root),
         "published": published,
-        "working": durable.holder(root),
+        "working": remote.holder(root),
         "in_progress": _in_progress(root),
         "quarantined": sorted(path.name for path in root.glob("quarantine/*.json")),
         "cpu_seconds": cpu_seconds,
@@ -335,6 +341,7 @@ def _in_progress(root: Path) -> dict[str, Any] | None:
     return {"demos": demos, "units": len(todo), "done": done}
 
 
+@remote.on_copy(files=remote.TABLES)
 def inspect(root: str | Path) -> Facts:
     """What is inside: counts, statistics a demo, rejects by reason, sizes."""
     root = Path(root)
@@ -349,6 +356,7 @@ def inspect(root: str | Path) -> Facts:
         "shards": len(found.shards),
         "splits": {name: entry.demos for name, entry in found.splits.items()},
         "rejects": found.rejects.model_dump(),
+        "missing": [f"{entry.demo_range[0]} to {entry.demo_range[1] - 1}: {entry.reason}" for entry in found.missing],
         "bytes": {"shards": manifest.total_bytes(found.shards)}
         | {name: manifest.total_bytes(stage.units) for name, stage in found.stages.items()},
         "created_by": found.created_by,
@@ -368,6 +376,7 @@ def _statistics(root: Path) -> dict[str, dict[str, float]]:
     }
 
 
+@remote.on_copy(units=True, leftovers=True)
 def gc(root: str | Path, *, dry_run: bool = False) -> Facts:
     """Removes units that the manifest does not name: other recipes, other labellings, what killed processes left.
 
@@ -378,8 +387,9 @@ def gc(root: str | Path, *, dry_run: bool = False) -> Facts:
         LockedError: if a command is at work on the dataset.
     """
     root = Path(root)
-    found = manifest.read(root)
+    manifest.read(root)  # what is no dataset is refused before it is locked
     with durable.lock(root):
+        found = manifest.read(root)
         doomed = _unnamed(root, found)
         size = sum(_size(path) for path in doomed)
         for path in () if dry_run else doomed:
@@ -397,5 +407,7 @@ def _unnamed(root: Path, found: Manifest) -> list[Path]:
 
 def _size(folder: Path) -> int:
     """Bytes that deleting a folder frees: files that others are linked to free nothing."""
+    if (stored := remote.size(folder)) is not None:
+        return stored
     facts = [path.stat() for path in folder.rglob("*") if path.is_file()]
     return sum(fact.st_size for fact in facts if fact.st_nlink == 1)

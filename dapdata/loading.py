@@ -16,10 +16,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dapdata import manifest, rng, store
+from dapdata import manifest, remote, rng, store
 from dapdata.errors import CorruptionError, FormatError, UsageError, hint, nearest, require
 from dapdata.manifest import Manifest
 from dapdata.records import Array
+from dapdata.remote import Place
 from dapdata.split import SPLITS
 from dapdata.store import COLUMNS, Block, Sample
 from dapdata.tables import Index
@@ -34,7 +35,7 @@ def open(root: str | Path, split: str | None = None) -> Dataset:
     """A labelled dataset, or one split of it.
 
     Args:
-        root: The dataset's folder.
+        root: The dataset's folder, or its URL: s3://, hf://, https:// and whatever else fsspec opens.
         split: "train", "val" or "test"; None for all demos.
 
     Raises:
@@ -42,35 +43,31 @@ def open(root: str | Path, split: str | None = None) -> Dataset:
         UsageError: if there is no such split.
         CorruptionError: if the manifest and the index don't agree.
     """
-    folder = locate(root)
-    found = manifest.read(folder)
+    place = remote.locate(root)
+    kept = remote.Kept(place)
+    with kept.named():
+        found = manifest.read(kept.root)
     if not found.shards:
-        raise FormatError(f"{folder}: generated but not labelled, expected shards; run `dapdata label {folder}`")
+        raise FormatError(f"{place}: generated but not labelled, expected shards; run `dapdata label {place}`")
     known = list(found.splits)
     if split is not None and split not in known:
         raise UsageError(f"split: got '{split}', expected one of {', '.join(SPLITS)}{hint(split, list(SPLITS))}")
-    index = manifest.read_index(folder)
+    index = manifest.read_index(kept.root)
     if index.rows != sum(entry.demos for entry in found.splits.values()):
-        raise CorruptionError(f"{folder}: index.parquet and manifest.json name different demos; run `dapdata verify {folder}`")
+        raise CorruptionError(f"{place}: index.parquet and manifest.json name different demos; run `dapdata verify {place}`")
     mine = index if split is None else index.only(np.flatnonzero(index.read("split") == split))
-    return Dataset(folder, split, found, mine)
-
-
-def locate(root: str | Path) -> Path:
-    """Where a dataset is on this machine: the one place that turns what a user names into a path."""
-    if "://" in str(root):
-        raise FormatError(f"{root}: a URL, expected a folder on this machine; copy the dataset here first")
-    return Path(root)
+    return Dataset(place, split, found, mine, kept)
 
 
 @dataclass
 class Dataset:
     """The demos of a dataset, or of one split of it, in demo order."""
 
-    root: Path
+    root: Place  # folder or URL
     split: str | None
     manifest: Manifest = field(repr=False)
     index: Index = field(repr=False)  # columns of index.parquet, for these demos
+    _kept: remote.Kept | None = field(default=None, repr=False)  # where the tables lie that columns are read from
     _held: dict[str, Block] = field(default_factory=dict, repr=False)
 
     @property
@@ -110,12 +107,17 @@ class Dataset:
         Raises:
             CorruptionError: if it isn't what was written.
         """
-        folder = self.root / shard
-        if not store.is_committed(folder):
-            raise CorruptionError(
-                f"{folder}: missing, expected a shard that the manifest names; run `dapdata verify {self.root}`"
-            )
-        return store.read_block(folder, _known_paths(paths))
+        with remote.unit(self.root, shard, _known_paths(paths)) as folder:
+            if not store.is_committed(folder):
+                raise CorruptionError(
+                    f"{folder}: missing, expected a shard that the manifest names; run `dapdata verify {self.root}`"
+                )
+            return store.read_block(folder, paths)
+
+    def files(self, names: Sequence[str]) -> dict[str, bytes]:
+        """The bytes of single files that the manifest names, such as previews, by their path."""
+        with remote.working_copy(self.root, files=names) as folder:
+            return {name: (folder / name).read_bytes() for name in names}
 
     def torch(self, paths: Sequence[str] | None = None) -> data.Dataset[Any]:
         """A map-style dataset of {path: tensor}, all of it in memory.

@@ -74,6 +74,14 @@ class StageEntry(Section):
     units: Sequence[UnitEntry] = Field(description="in demo order; empty if it is to be run again")
 
 
+class MissingEntry(Section):
+    """Demos that are not there because their unit failed, in a dataset that was published all the same."""
+
+    demo_range: tuple[int, int] = Field(description="first demo, and one past the last")
+    stage: str = Field(description="that failed; those after it were not run")
+    reason: str = Field(description="how its last try ended")
+
+
 class SplitEntry(Section):
     """A split and the instances in it; no instance is in two splits."""
 
@@ -93,12 +101,15 @@ class Rejects(Section):
 class _Facts(Section):
     name: str
     task: str
-    demos: int = Field(ge=0, description="demos asked for; those in the shards are this less rejects.demos")
+    demos: int = Field(ge=0, description="demos asked for; those in the shards are this less rejects.demos and missing")
     content_sha256: Sha256 = Field(description="over the decoded arrays of every demo, in demo order")
     recipe: dict[str, Any] = Field(description="resolved: every default filled in")
     recipe_sha256: Sha256 = Field(description="of the resolved recipe as canonical JSON")
     splits: dict[str, SplitEntry] = Field(description="train, val, test; unused: would share an instance with two of them")
     rejects: Rejects
+    missing: list[MissingEntry] = Field(
+        default=[], description="units that failed; empty unless published with --allow-missing"
+    )
     files: dict[RelativePath, Sha256] = Field(description="every other file that belongs to the dataset")
     created_by: dict[str, str] = Field(description="versions of the packages that wrote it")
 

@@ -46,7 +46,7 @@ async function library() {
 // ---- tables: columns of values; sorted by a click on a head, filtered by words and comparisons
 const ROWS = 50;
 const written = (value, column) =>
-  value === null ? "–" : typeof value === "number" ? value.toLocaleString("en-US", { maximumFractionDigits: column.digits ?? 2 }) : String(value);
+  value === null ? "–" : typeof value === "number" ? (Number(value.toFixed(column.digits)) + 0).toLocaleString("en-US", { maximumFractionDigits: column.digits }) : String(value); // + 0: no "-0"
 function condition(term, columns) {
   const [, name, sign, wanted] = term.match(/^(\w+)(>=|<=|!=|=|>|<)(.+)$/) ?? [];
   const column = columns.find(c => c.name === name);

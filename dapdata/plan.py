@@ -113,7 +113,7 @@ def make_plan(
     Args:
         layout: Where units are and what their keys are.
         stages: Those that the command runs, in order.
-        units: All units of the dataset.
+        units: Those of the dataset that the command is to look after.
         resolved: The recipe.
         previous: What the folder was made for before.
         cost: Seconds and bytes of one demo in each stage.
@@ -129,7 +129,8 @@ def make_plan(
         found.append(StagePlan(stage.name, len(units), len(units) - len(todo), demos, tuple(reasons)))
         seconds, size = seconds + demos * cost[stage.name][0], size + demos * cost[stage.name][1]
         files += len(todo) * _files_of_a_unit(stage, stages)
-    return Plan(str(layout.root), units[-1].stop, tuple(found), size / 1e9, files, seconds / 60)
+    asked = sum(unit.stop - unit.start for unit in units)
+    return Plan(str(layout.root), asked, tuple(found), size / 1e9, files, seconds / 60)
 
 
 def _files_of_a_unit(stage: Stage, stages: Sequence[Stage]) -> int:

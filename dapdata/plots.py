@@ -98,7 +98,7 @@ def histogram(values: Array, height: int = 150) -> Figure:
             "x": (edges[:-1] + edges[1:]) / 2,
             "y": counts,
             "width": np.diff(edges) * 0.92,
-            "marker": {"color": BAR},
+            "marker": {"color": BAR, "line": {"width": 0}},
             "customdata": says,
             "hovertemplate": "%{customdata}: %{y:,}<extra></extra>",
         },
@@ -129,8 +129,8 @@ def text(name: str) -> str:
 
 
 def number(value: float | None) -> str:
-    """A value with thousands separated and no more decimals than tell it apart; a dash for None."""
-    if value is None:
+    """A value with thousands separated and no more decimals than tell it apart; a dash for None and what is not finite."""
+    if value is None or not np.isfinite(value):
         return "–"
     if abs(value) >= 100 or value == round(value):
         return f"{value:,.0f}"
@@ -157,7 +157,7 @@ def bars(counts: Mapping[str, int], *more: tuple[str, Mapping[str, int]], name: 
                 "text": [f"{row.get(key, 0):,}" for key in names],
                 "textposition": "outside",
                 "cliponaxis": False,
-                "marker": {"color": COLORS[i] if more else BAR},
+                "marker": {"color": COLORS[i] if more else BAR, "line": {"width": 0}},
                 "hovertemplate": "%{y}: %{x:,}<extra></extra>",
             }
             for i, (label, row) in enumerate(series)
@@ -252,7 +252,7 @@ def lines(drawn: Sequence[Line], x: str, *, log: bool = False, percent: bool = F
                 "mode": "lines+markers" if len(line.x) <= 40 else "lines",
                 "line": {"color": line.color, "width": 2, "dash": "dot" if line.dashed else "solid"},
                 "marker": {"size": 7},
-                "customdata": [says(rate) for rate in intervals] or [number(value) for value in line.y if value is not None],  # type: ignore[arg-type]
+                "customdata": [says(rate) for rate in intervals] or [number(value) for value in line.y],  # type: ignore[arg-type]
                 "hovertemplate": f"{x} %{{x:,}}: %{{customdata}}",
             }
         )

@@ -16,10 +16,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dapdata import errors, loading, manifest, page, plots, records, viewer
+from dapdata import errors, loading, page, plots, records, viewer
 from dapdata.loading import Dataset
 from dapdata.page import Column, Section
 from dapdata.pictures import Shown, file, panels, sheet
+from dapdata.remote import Place
 
 Array = NDArray[Any]
 
@@ -34,7 +35,7 @@ STATISTICS = (
 )
 
 
-def choose(dataset: Path, demos: Sequence[int] | None = None, count: int = 4) -> list[Shown]:
+def choose(dataset: Place, demos: Sequence[int] | None = None, count: int = 4) -> list[Shown]:
     """Some demos of a dataset: those asked for by their number, or `count` of them spread over it evenly.
 
     Raises:
@@ -62,20 +63,20 @@ def _spread(number: int, most: int) -> Array:
     return np.unique(np.linspace(0, number - 1, min(most, number)).astype(int))
 
 
-def contact_sheet(dataset: Path, out: Path | None = None, demos: Sequence[int] | None = None, count: int = 4) -> Path:
+def contact_sheet(dataset: Place, out: Path | None = None, demos: Sequence[int] | None = None, count: int = 4) -> Path:
     """Writes a contact sheet of a dataset and returns its path (default: `<dataset's name>.png` here).
 
     Args:
-        dataset: A dataset folder.
+        dataset: A dataset's folder or URL.
         out: The PNG to write.
         demos: Numbers of the demos to show; default: `count` of them, spread evenly over the splits.
         count: How many, when `demos` is not given.
     """
-    about = manifest.read(Path(dataset))
-    return _write(out or Path(f"{about.name}.png"), sheet(choose(Path(dataset), demos, count), about.name))
+    about = loading.open(dataset).manifest
+    return _write(out or Path(f"{about.name}.png"), sheet(choose(dataset, demos, count), about.name))
 
 
-def preview(dataset: Path) -> dict[str, bytes]:
+def preview(dataset: Place) -> dict[str, bytes]:
     """The two small pictures (PNG) of a dataset's card by their path in the dataset, made from its first demo."""
     sample = choose(dataset, count=1)[0].sample
     pictures = panels(sample, float(sample["container/points"][:, 2].max()))
@@ -86,24 +87,24 @@ def preview(dataset: Path) -> dict[str, bytes]:
     }
 
 
-def show_html(dataset: Path, out: Path | None = None, demos: Sequence[int] | None = None, count: int = 4) -> Path:
+def show_html(dataset: Place, out: Path | None = None, demos: Sequence[int] | None = None, count: int = 4) -> Path:
     """Writes one self-contained HTML page about a dataset and returns its path (default: `<dataset's name>.html` here).
 
     Arguments as in `contact_sheet`. The page loads nothing from a network.
     """
     found = loading.open(dataset)
-    shown = choose(Path(dataset), demos, count)
+    shown = choose(dataset, demos, count)
     return _write(out or Path(f"{found.manifest.name}.html"), dataset_page(found, shown).encode())
 
 
-def show_rerun(dataset: Path, out: Path | None = None, demos: Sequence[int] | None = None, count: int = 4) -> Path | None:
+def show_rerun(dataset: Place, out: Path | None = None, demos: Sequence[int] | None = None, count: int = 4) -> Path | None:
     """Shows demos of a dataset in the rerun viewer, or writes them to `out`, an .rrd file, and returns its path.
 
     Arguments as in `contact_sheet`; raises as `live.stream` does.
     """
     from dapdata import live
 
-    live.stream(choose(Path(dataset), demos, count), manifest.read(Path(dataset)).name, out)
+    live.stream(choose(dataset, demos, count), loading.open(dataset).manifest.name, out)
     return out
 
 

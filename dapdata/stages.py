@@ -8,6 +8,7 @@ the engine and the paths are not in it, so a dataset grows and moves without bei
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -19,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from dapdata import durable
+from dapdata.errors import UsageError
 from dapdata.records import Record, Rejected
 
 FORMAT = 1  # part of every key: another format makes every unit anew
@@ -57,6 +59,22 @@ class Unit:
 def units(demos: int, shard_size: int) -> list[Unit]:
     """The demos of a dataset in units; the last may be smaller."""
     return [Unit(i, first, min(first + shard_size, demos)) for i, first in enumerate(range(0, demos, shard_size))]
+
+
+def stripe(text: str, units: Sequence[Unit]) -> list[Unit]:
+    """Every N-th unit from the I-th on, for a text "I/N": the same ones whoever works on them, and with how many workers.
+
+    Raises:
+        UsageError: if the text is no such thing.
+    """
+    found = re.fullmatch(r"(\d+)/(\d+)", text)
+    index, count = map(int, found.groups()) if found else (0, 0)
+    if index >= count:
+        raise UsageError(
+            f"--units: got '{text}', expected I/N with I from 0 to N - 1, such as 0/8 to 7/8; in an array job I is the "
+            "number of the task, counted from 0"
+        )
+    return list(units[index::count])
 
 
 def specs(stages: Sequence[Stage], resolved: Mapping[str, Any]) -> dict[str, Spec]:

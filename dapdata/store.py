@@ -372,6 +372,12 @@ def read_block(folder: Path, paths: Sequence[str] | None = None) -> Block:
     return Block(arrays, len(record["rows"]))
 
 
+def files_of(record: Mapping[str, Any], paths: Sequence[str] | None = None) -> list[str]:
+    """The files of a unit that `read_block` needs besides the root: those of some arrays and their offsets, or all."""
+    wanted = "" if paths is None else tuple(f"{path}/" for path in _with_offsets(paths))
+    return [name for name in record["files"] if name.startswith(wanted)]
+
+
 def _stored(record: Mapping[str, Any]) -> list[str]:
     """Paths of the arrays of a unit that this version knows, offsets included."""
     names = [name.removesuffix("/zarr.json") for name in record["files"] if name.count("/") == 2]

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import resource
+import socket
 import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -17,12 +18,12 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from dapdata import card, croissant, durable, manifest, rng, split, store
+from dapdata import card, croissant, durable, manifest, remote, rng, split, store
 from dapdata.config import SplitConfig
-from dapdata.errors import CorruptionError, DapdataError, UsageError
-from dapdata.manifest import Manifest, Rejects, SplitEntry, StageEntry, UnitEntry
+from dapdata.errors import CorruptionError, DapdataError, EnvironmentProblem, UsageError
+from dapdata.manifest import Manifest, MissingEntry, Rejects, SplitEntry, StageEntry, UnitEntry
 from dapdata.records import Demo, Record, Rejected, read_record, to_sample
-from dapdata.stages import Layout, Spec, Stage, Unit
+from dapdata.stages import Layout, Spec, Stage, Unit, changes, specs
 from dapdata.tables import Index, insert_words, writer
 
 CALL = "dapdata.units:run_unit"
@@ -43,7 +44,7 @@ Made = dict[int, Record]  # by demo
 class Work:
     """A job: what to make of which demos. As JSON it holds names and numbers only."""
 
-    root: str
+    root: str  # the dataset's folder or URL
     table: str  # module that holds STAGES, in order, and parse(resolved) -> recipe
     recipe: dict[str, Any]
     specs: dict[str, Spec]
@@ -73,17 +74,19 @@ def run_unit(text: str) -> str:
     """
     work = Work(**json.loads(text))
     try:
-        with durable.disk_problems(Path(work.root), work.needed):
-            return json.dumps(_make(work))
+        with remote.working_copy(work.root, files=()) as root, durable.disk_problems(remote.scratch_of(root), work.needed):
+            return json.dumps(_make(work, root))
     except DapdataError as error:
         return json.dumps({"error": [type(error).__name__, str(error)]})
 
 
-def _make(work: Work) -> dict[str, Any]:
+def _make(work: Work, root: Path) -> dict[str, Any]:
     table = import_module(work.table)
     stages: dict[str, Stage] = {stage.name: stage for stage in table.STAGES}
-    layout = layout_of(Path(work.root), table.STAGES, work.specs, work.recipe)
+    layout = layout_of(root, table.STAGES, work.specs, work.recipe)
+    _check_versions(work, specs(table.STAGES, work.recipe))
     recipe, unit = table.parse(work.recipe), Unit(*work.unit)
+    remote.pull(root, [layout.path(name, unit) for name in layout.plan])
     made: dict[str, Made] = {}
     told = []
     for stage in (stages[name] for name in work.stages):
@@ -110,6 +113,16 @@ def _make(work: Work) -> dict[str, Any]:
             }
         )
     return {"made": told}
+
+
+def _check_versions(work: Work, here: Mapping[str, Spec]) -> None:
+    """Refuses to make what is keyed by other versions than those that are installed where the unit is made."""
+    differences = [line for stage in work.stages for line in changes(work.specs[stage], here[stage])]
+    if differences:
+        raise EnvironmentProblem(
+            f"{socket.gethostname()}: not what the unit is made for ({'; '.join(sorted(set(differences)))}), expected the same "
+            "versions on every machine that works; install them there"
+        )
 
 
 # Running a stage -------------------------------------------------------------------------------------------
@@ -168,6 +181,7 @@ def _no_demo(recipe: Any, stage: Stage, demo: int, reasons: Counter[str]) -> str
 def _load(layout: Layout, stage: Stage, unit: Unit) -> Made:
     """The records of a committed unit, after its files were compared with their hashes."""
     folder = layout.folder(stage.name, unit)
+    remote.fill(folder)
     record = store.read_record(folder)
     damage = next(store.damaged_files(folder, record), None)
     if damage or record["key"] != layout.key(stage.name, unit):
@@ -250,9 +264,14 @@ def describe(sample: store.Sample) -> dict[str, int]:
 
 
 def publish(
-    layout: Layout, stages: Sequence[Stage], recipe: Mapping[str, Any], config: SplitConfig, units: Sequence[Unit]
+    layout: Layout,
+    stages: Sequence[Stage],
+    recipe: Mapping[str, Any],
+    config: SplitConfig,
+    units: Sequence[Unit],
+    missing: Sequence[MissingEntry] = (),
 ) -> Manifest:
-    """Writes manifest, index and card for what is there; the shards are named if all of them are.
+    """Writes manifest, index and card for what is there; a stage is named if all of its units are, but for the missing.
 
     Args:
         layout: Where units are.
@@ -260,17 +279,21 @@ def publish(
         recipe: Resolved.
         config: The recipe's split section.
         units: All units of the dataset.
+        missing: Those that failed, and that the dataset is to do without.
 
     Returns:
         The manifest as it is read again.
     """
-    whole = [stage for stage in stages if is_whole(layout, stage.name, units)]
+    there = {stage.name: _there(layout, stage.name, units) for stage in stages}
+    spared = {entry.demo_range for entry in missing}
+    absent = {name: {(unit.start, unit.stop) for unit in {*units} - {*found}} for name, found in there.items()}
+    whole = [stage for stage in stages if there[stage.name] and absent[stage.name] <= spared]
     with durable.staged(layout.root, "tables") as folder:
-        content, rejects = _gather(layout, whole, recipe, units, folder)
+        content, rejects = _gather(layout, whole, recipe, there, folder)
         index = _index(folder, config, recipe["seed"])
         large = len(whole) * len(units) + 2 * (index.rows if index else 0) > manifest.LARGE
         entries: dict[str, Sequence[UnitEntry]] = {
-            stage.name: manifest.Units(folder / manifest.UNITS, stage.name, len(units)) for stage in whole
+            stage.name: manifest.Units(folder / manifest.UNITS, stage.name, len(there[stage.name])) for stage in whole
         }
         if not large:
             entries = {name: list(found) for name, found in entries.items()}
@@ -285,6 +308,7 @@ def publish(
             shards=[],
             splits=_splits(index, large) if index else {},
             rejects=rejects,
+            missing=list(missing),
             stages={},
             files={},
             created_by={"dapdata": _version()} | store.created_by(),
@@ -298,14 +322,15 @@ def publish(
     return manifest.read(layout.root)
 
 
-def is_whole(layout: Layout, stage: str, units: Sequence[Unit]) -> bool:
-    """Whether all units of a stage are there."""
+def _there(layout: Layout, stage: str, units: Sequence[Unit]) -> list[Unit]:
+    """Those of the units that are there in a stage."""
     paths = [layout.path(stage, unit) for unit in units]
-    return len(store.committed(layout.root, paths)) == len(paths)
+    found = store.committed(layout.root, paths)
+    return [unit for unit, path in zip(units, paths) if path in found]
 
 
 def _gather(
-    layout: Layout, whole: Sequence[Stage], recipe: Mapping[str, Any], units: Sequence[Unit], folder: Path
+    layout: Layout, whole: Sequence[Stage], recipe: Mapping[str, Any], there: Mapping[str, Sequence[Unit]], folder: Path
 ) -> tuple[str, Rejects]:
     """Writes the tables of what the units say of themselves; their content digest, and all rejects.
 
@@ -315,7 +340,7 @@ def _gather(
     content, rejects = store.ContentDigest(), {what: Counter[str]() for what in Rejects.model_fields}
     with writer(folder / manifest.UNITS) as entries, writer(folder / ROWS) as rows:
         for stage in whole:
-            for unit in units:
+            for unit in there[stage.name]:
                 entry, record = _entry(layout, stage, unit)
                 entries.add([manifest.unit_row(stage.name, entry)])
                 for what, counts in record["rejects"].items():

@@ -3,7 +3,7 @@ document.addEventListener("plotting", () => {
   const { views, colours, colour: first } = content("views"), $ = id => document.getElementById(id), stage = $("stage");
   const DISTANCE = 1.2; // of the eye from the middle of the view, which the container spans with about 1.1
   const switched = {}; // layer name -> shown, once somebody has clicked it
-  let view = null, eye = null;
+  let view = null;
 
   // ---- arrays and geometry
   const numbers = (text, Kind) => new Kind(bytes(text).buffer);
@@ -55,7 +55,7 @@ document.addEventListener("plotting", () => {
   };
   const coloured = layer => {
     const values = view.clouds[layer.cloud].values[colour()];
-    if (!values) return { color: colours.find(c => c.name === "plain").scale[0][1] };
+    if (!values) return { color: colours.find(c => c.name === "plain").scale[0][1], lighting: { ...MATT, ambient: 0.45, diffuse: 0.8 } }; // light alone tells the shape
     const small = bytes(values), intensity = new Float32Array(6 * small.length);
     for (let v = 0; v < intensity.length; v++) intensity[v] = small[Math.floor(v / 6)] / 255;
     return { intensity, colorscale: colours.find(c => c.name === colour()).scale, cmin: 0, cmax: 1, showscale: false };
@@ -67,25 +67,22 @@ document.addEventListener("plotting", () => {
       return { ...layer.trace, ...(layer.kind === "cloud" ? coloured(layer) : {}), visible: isShown(layer), name: layer.name, showlegend: false };
     });
   }
-  function draw() {
+  function draw(camera = stage.layout.scene.camera) {
     const ratio = 2.2 * view.reach / view.extent; // so that a metre is as long for each demo's own size, whatever is shown
     const axis = a => ({ visible: false, range: [view.center[a] - view.reach, view.center[a] + view.reach] });
-    const layout = { margin: { l: 0, r: 0, t: 0, b: 0 }, paper_bgcolor: "rgba(0,0,0,0)", modebar: { bgcolor: "rgba(0,0,0,0)", color: inked("--rule"), activecolor: inked("--soft") }, uirevision: view.demo,
+    const layout = { margin: { l: 0, r: 0, t: 0, b: 0 }, paper_bgcolor: "rgba(0,0,0,0)", modebar: { bgcolor: "rgba(0,0,0,0)", color: inked("--rule"), activecolor: inked("--soft") },
       hoverlabel: { bgcolor: inked("--paper"), bordercolor: inked("--soft"), font: { color: inked("--ink") } },
-      scene: { xaxis: axis(0), yaxis: axis(1), zaxis: axis(2), aspectmode: "manual", aspectratio: { x: ratio, y: ratio, z: ratio }, dragmode: "turntable", camera: { eye, center: { x: 0, y: 0, z: 0 }, up: { x: 0, y: 0, z: 1 } } } };
+      scene: { xaxis: axis(0), yaxis: axis(1), zaxis: axis(2), aspectmode: "manual", aspectratio: { x: ratio, y: ratio, z: ratio }, dragmode: "turntable", camera } };
     return Plotly.react(stage, traces(), layout, { ...CONFIG, modeBarButtons: [["toImage", "tableRotation", "pan3d"]] });
   }
   drawers.push(() => draw());
 
   // ---- where it is looked at from
-  function away(direction) {
+  function from(direction) {
     const [x, y, z] = direction.map(part => DISTANCE * part / Math.hypot(...direction));
-    return { x, y, z };
+    return { eye: { x, y, z }, center: { x: 0, y: 0, z: 0 }, up: { x: 0, y: 0, z: 1 } };
   }
-  function look(direction) {
-    eye = away(direction);
-    return Plotly.relayout(stage, { "scene.camera": { eye, center: { x: 0, y: 0, z: 0 }, up: { x: 0, y: 0, z: 1 } } });
-  }
+  const look = direction => Plotly.relayout(stage, { "scene.camera": from(direction) });
   function zoom(factor) {
     const now = stage.layout.scene.camera.eye;
     return Plotly.relayout(stage, { "scene.camera.eye": { x: now.x * factor, y: now.y * factor, z: now.z * factor } });
@@ -106,9 +103,8 @@ document.addEventListener("plotting", () => {
       const swatch = layer.color ? [element("i", { className: "swatch", style: `background: ${layer.color}` })] : [];
       return element("label", {}, box, layer.name + count, ...swatch);
     }));
-    eye = away(view.eye);
     legend();
-    return draw();
+    return draw(from(view.eye));
   }
   function legend() {
     const { scale, ends, name } = colours.find(c => c.name === colour());

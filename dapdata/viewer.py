@@ -98,13 +98,13 @@ def view(
         most: Points of a cloud that are kept; of more, so many are kept that are spread evenly.
     """
     sample = shown.sample
-    name, counts = title(shown)
+    _, counts = title(shown)
     points = sample["container/points"].astype(float)
     low, high = points.min(axis=0), points.max(axis=0)
     front = front_view(sample, 64, 48)
     return {
         "demo": int(sample["meta/demo"]),
-        "name": name,
+        "name": f"demo {int(sample['meta/demo'])} · {shown.split} · {shown.task}",
         "note": note or counts,
         "top": f"{max(high[2], 1e-3):.2f} m",
         "center": ((low + high) / 2).tolist(),

@@ -28,7 +28,7 @@ reader never sees half of a dataset. Its fields are in [`schemas/manifest.schema
 
 | path | holds |
 |---|---|
-| `manifest.json` | format, `content_sha256`, resolved recipe, shards, splits with their instances, rejects by reason, stages |
+| `manifest.json` | format, `content_sha256`, resolved recipe, shards, splits, rejects and missing demos by reason, stages |
 | `index.parquet` | one row per demo: split, shard, row, instances, counts, rejects |
 | `units.parquet` | large datasets only: one row per unit, see below |
 | `README.md`, `preview/` | dataset card and pictures |

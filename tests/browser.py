@@ -34,7 +34,8 @@ const watch = new PerformanceObserver(list => requests.push(...list.getEntries()
 watch.observe({ type: "resource", buffered: true });
 </script>"""
 ACT = """<script>
-const until = async holds => { for (let i = 0; i < 400 && !holds(); i++) await new Promise(done => setTimeout(done, 50)); };
+const wait = () => new Promise(done => setTimeout(done, 50));
+const until = async (holds, most = 400) => { for (let i = 0; i < most && !holds(); i++) await wait(); };
 const $ = selector => document.querySelector(selector), $$ = selector => [...document.querySelectorAll(selector)];
 const drawn = () => !$("#library") && $$(".plot, .stage").every(box => box.querySelector(".main-svg"));
 (async () => {

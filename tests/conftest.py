@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import signal
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,8 @@ import toy_stages
 from dapdata import pipeline, recipe
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+# A suite that was started in the background ignores Ctrl-C, and so would the commands that it starts.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 TINY = {
     "name": "tiny",
@@ -60,7 +63,7 @@ def toy_copy(toy: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(toy, tmp_path / "toy"))
 
 
-def make_toy(root: Path, demos: int = 8, shard_size: int = 3, workers: int = 1, engine: str = "inline") -> Path:
+def make_toy(root: Path | str, demos: int = 8, shard_size: int = 3, workers: int = 1, engine: str = "inline") -> Path:
     """Generates and labels with the toy stages."""
     pipeline.generate(toy_stages.toy_recipe(demos, shard_size), root, workers=workers, engine=engine, table="toy_stages")
     pipeline.label(root, workers=workers, engine=engine, table="toy_stages")

@@ -16,17 +16,17 @@ DAPDATA = sorted((ROOT / "dapdata").rglob("*.py"))
 DAPTRAIN = sorted((ROOT / "train/daptrain").rglob("*.py"))
 
 # A module imports only from lines above its own. Modules of a package may import their siblings in observe, which is one
-# stage, in interop, and in tasks/mixed.py, which is made of the other tasks.
+# stage, in engines, which is one interface, in interop, and in tasks/mixed.py, which is made of the other tasks.
 LINES = (
     ("errors", "rng", "poses", "config"),
     ("records", "strict_yaml", "durable", "clouds", "console"),
-    ("solids", "meshes", "keys", "slic", "split", "matching", "tables"),
+    ("solids", "meshes", "keys", "slic", "split", "matching", "tables", "buckets"),
     ("tabletop",),
     ("tasks",),
     ("simulate", "observe", "cluster", "labels"),
     ("recipe", "store", "stages", "engines", "manifest", "card", "report", "predictions"),
-    ("croissant",),
-    ("plan", "units"),
+    ("croissant", "remote"),
+    ("plan", "units", "slurm"),
     ("pipeline",),
     ("loading", "draw", "schemas", "plots"),
     ("metrics", "health", "pictures", "page"),
@@ -38,7 +38,7 @@ LINES = (
 LINE = {module: number for number, modules in enumerate(LINES) for module in modules}
 DOMAIN = frozenset(("solids", "meshes", "tabletop", "tasks", "simulate", "observe", "cluster", "labels"))
 MUST_NOT_KNOW = {
-    **dict.fromkeys(("store", "stages", "engines", "manifest"), DOMAIN),
+    **dict.fromkeys(("store", "stages", "engines", "manifest", "buckets", "remote"), DOMAIN),
     **dict.fromkeys(
         ("loading", "metrics", "card", "croissant", "show", "interop"), frozenset(("pipeline", "engines", "tasks"))
     ),
@@ -55,11 +55,13 @@ DOORS = {
     "typer": {"cli"},
     "trimesh": {"solids", "meshes"},
     "ray": {"engines"},
-    "pebble": {"engines"},
+    "grpc": {"engines"},
     "torch": {"loading", "daptrain"},
     "yaml": {"strict_yaml"},
     "plotly": {"plots"},
     "rerun": {"live"},
+    "fsspec": {"buckets"},
+    "s3fs": {"buckets"},
 }
 HEAVY = (
     "pybullet",
@@ -75,6 +77,8 @@ HEAVY = (
     "rich",
     "plotly",
     "rerun",
+    "fsspec",
+    "s3fs",
 )
 QUATERNION_WORDS = ("quat", "getEulerFromQuaternion", "as_quat")
 
@@ -135,7 +139,7 @@ def test_a_file_imports_only_from_lines_above_its_own(path: Path) -> None:
         other = rest.split(".")[0]
         if package == "daptrain":
             wrong += [f"{path}:{line}: {name}"] if own not in ("cli",) else []
-        among_siblings = own == other and (own in ("observe", "interop") or path.stem == "mixed")
+        among_siblings = own == other and (own in ("observe", "engines", "interop") or path.stem == "mixed")
         if package != "dapdata" or other not in LINE or among_siblings:
             continue
         if LINE[other] >= LINE[own] or other in MUST_NOT_KNOW.get(own, ()):

@@ -19,7 +19,7 @@ import yaml
 from conftest import make_toy
 from toy_stages import toy_recipe
 
-from dapdata import card, croissant, health, loading, manifest, pipeline, records
+from dapdata import card, croissant, health, loading, manifest, pipeline, recipe, records
 
 
 def card_of(root: Path) -> str:
@@ -55,6 +55,12 @@ def test_the_loader_of_the_card_runs_in_the_datasets_folder_and_has_five_lines(t
     subprocess.run([sys.executable, "-c", snippet + check], cwd=tiny, check=True, env=os.environ)
 
 
+def test_the_recipe_of_the_card_is_the_datasets(tiny: Path, tmp_path: Path) -> None:
+    (tmp_path / "again.yaml").write_text(block(card_of(tiny), "json"))
+    assert recipe.resolve(recipe.load(tmp_path / "again.yaml")) == manifest.read(tiny).recipe
+
+
+@pytest.mark.slow
 def test_the_recipe_of_the_card_makes_the_dataset_again(tiny: Path, tmp_path: Path) -> None:
     (tmp_path / "again.yaml").write_text(block(card_of(tiny), "json"))
     again = pipeline.generate(tmp_path / "again.yaml", tmp_path / "again", engine="inline")

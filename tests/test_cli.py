@@ -71,11 +71,11 @@ def test_every_command_has_help_with_an_example(name: str, capsys: pytest.Captur
 def test_the_commands_are_those_of_the_interface() -> None:
     assert set(COMMANDS) == {
         "init", "generate", "label", "train", "eval", "judge", "predict", "run", "status", "inspect", "verify", "show", "gc",
-        "schema", "bench", "compare", "doctor", "export",
+        "schema", "bench", "compare", "doctor", "export", "slurm",
     }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", sorted(set(COMMANDS) - {"init", "schema", "export"}))
+@pytest.mark.parametrize("name", sorted(set(COMMANDS) - {"init", "schema", "export", "slurm"}))
 def test_every_command_that_reports_does_so_for_machines_too(name: str) -> None:
     assert "--json" in {option for parameter in COMMANDS[name].params for option in parameter.opts}
 
@@ -158,7 +158,7 @@ def test_a_missing_simulator_is_told_by_the_command_that_needs_it(tiny_recipe: P
 
 LIGHT = """
 import sys
-for name in ("pybullet", "trimesh", "open3d", "numba", "scipy", "matplotlib", "pebble", "torch", "safetensors"):
+for name in ("pybullet", "trimesh", "open3d", "numba", "scipy", "matplotlib", "torch", "safetensors"):
     sys.modules[name] = None
 import dapdata
 from dapdata import cli

@@ -130,7 +130,6 @@ def refused(root: object, kind: type[Exception], split: str | None = None) -> st
 def test_folders_that_are_no_dataset_are_refused(tmp_path: Path) -> None:
     assert "no such folder" in refused(tmp_path / "nowhere", FormatError)
     assert "no manifest.json" in refused(tmp_path, FormatError)
-    assert "a URL" in refused("s3://bucket/data", FormatError)
 
 
 def test_other_formats_say_who_made_them_and_what_to_do(toy_copy: Path) -> None:

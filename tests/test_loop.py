@@ -142,6 +142,14 @@ def test_minutes_end_the_training_in_time(material, tmp_path):
     assert rates[-1] < 0.5 * max(rates)  # a slow step may be the last one
 
 
+def test_time_that_runs_out_between_two_steps_still_leaves_weights(material, tmp_path, monkeypatch):
+    shares = iter([0.0, 0.99])
+    monkeypatch.setattr(loop.Budget, "share", lambda budget, step: next(shares, 1.0))
+    progress = loop.fit("pose", material, tmp_path, TINY, "dap", loop.Budget(seconds=60.0), CPU)
+    assert progress.step == 2
+    assert {"pose.safetensors", "pose.last.safetensors"} <= {path.name for path in tmp_path.iterdir()}
+
+
 @pytest.mark.parametrize("seconds", [0.0, -3.0])
 def test_a_budget_that_preparation_used_up_still_makes_one_step(material, tmp_path, seconds):
     assert loop.fit("pose", material, tmp_path, TINY, "dap", loop.Budget(seconds=seconds), CPU).step == 1

@@ -26,7 +26,14 @@ from daptrain.page import Material
 
 HOSTILE = """</script><script>problems.push("ran")</script><img src=x onerror='problems.push("ran")'>"&'"""
 LOG = [
-    {"net": net, "step": step, "loss": 1 / step, "seconds": 1.0, **({"val_iou": 0.5} if step == 40 else {})}
+    {
+        "net": net,
+        "step": step,
+        "loss": 1 / step,
+        "val_moved_mm": float("inf"),
+        "seconds": 1.0,
+        **({"val_iou": 0.5} if step == 40 else {}),
+    }
     for net in ("affordance", "pose")
     for step in (20, 40)
 ]

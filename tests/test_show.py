@@ -220,10 +220,10 @@ def hostile(tiny: Path) -> str:
             "created_by": {HOSTILE: HOSTILE},
         }
     )
-    index = {**found.index, "task": np.array([HOSTILE, *["x"] * (len(found) - 1)])}
-    index["split"] = np.array([HOSTILE] * len(found))
+    found.index["task"][0] = HOSTILE  # columns are kept once they were read
+    found.index["split"][:] = HOSTILE
     shown = [dataclasses.replace(s, task=HOSTILE, split=HOSTILE) for s in show.choose(tiny, count=1)]
-    return show.dataset_page(dataclasses.replace(found, manifest=about, index=index), shown)
+    return show.dataset_page(dataclasses.replace(found, manifest=about), shown)
 
 
 def test_names_cannot_break_out_of_the_page(hostile: str) -> None:
@@ -325,6 +325,32 @@ def test_a_switch_takes_what_it_names_out_of_the_view(tiny: Path, tmp_path: Path
 
 @pytest.mark.slow
 @needs_browser
+def test_who_turned_the_view_and_switches_a_layer_goes_on_from_there(tiny: Path, tmp_path: Path) -> None:
+    html = show.dataset_page(loading.open(tiny), show.choose(tiny, count=1))
+    script = """
+    const eye = () => JSON.stringify($("#stage").layout.scene.camera.eye);
+    const rest = async () => { for (let last = ""; last !== eye(); await until(() => false, 10)) last = eye(); return eye(); };
+    const canvas = $("#stage canvas"), box = canvas.getBoundingClientRect();
+    const mouse = (type, dx, buttons) => canvas.dispatchEvent(new MouseEvent(type,
+      { bubbles: true, buttons, clientX: box.x + box.width / 2 + dx, clientY: box.y + 100 }));
+    const eyes = [await rest()];
+    mouse("mousedown", 0, 1);
+    for (let dx = 10; dx <= 60; dx += 10) { mouse("mousemove", dx, 1); await until(() => false, 2); }
+    mouse("mouseup", 60, 0);
+    eyes.push(await rest());
+    $("#nearer").click();
+    eyes.push(await rest());
+    $$("#layers input")[0].click();
+    eyes.push(await rest());
+    return eyes;
+    """
+    front, turned, nearer, switched = open_page(html, tmp_path, script)
+    assert front != turned != nearer
+    assert switched == nearer
+
+
+@pytest.mark.slow
+@needs_browser
 def test_every_layer_and_colour_of_the_view_is_drawn_on_a_phone_too(tiny: Path, tmp_path: Path) -> None:
     html = show.dataset_page(loading.open(tiny), show.choose(tiny, count=1))
     script = """
@@ -336,6 +362,11 @@ def test_every_layer_and_colour_of_the_view_is_drawn_on_a_phone_too(tiny: Path, 
       choice.click();
       scales.add(JSON.stringify($("#stage").data.find(t => t.intensity)?.intensity.slice(0, 6000)));
     }
+    const middle = name => {
+      const trace = $("#stage").data.find(t => t.name === name);
+      return ["x", "y", "z"].map(a => (Math.min(...trace[a]) + Math.max(...trace[a])) / 2);
+    };
+    const middles = ["container cloud", "demonstrated goal", "object cloud, demonstrated"].map(middle);
     $("#theme").click();
     const eye = () => JSON.stringify($("#stage").layout.scene.camera.eye), eyes = [eye()];
     for (const id of ["above", "nearer", "further", "front"]) {
@@ -343,12 +374,18 @@ def test_every_layer_and_colour_of_the_view_is_drawn_on_a_phone_too(tiny: Path, 
       await until(() => eye() !== eyes.at(-1));
       eyes.push(eye());
     }
-    return { start, all, layers: $$("#layers input").map(b => b.name), scales: scales.size, eyes: new Set(eyes).size,
-      dark: getComputedStyle(document.body).backgroundColor, wide: document.body.scrollWidth };
+    return { start, all, middles, layers: $$("#layers input").map(b => b.name), scales: scales.size,
+      eyes: new Set(eyes).size, dark: getComputedStyle(document.body).backgroundColor, wide: document.body.scrollWidth };
     """
     found = open_page(html, tmp_path, script, width=500)
     assert set(found["start"]) < set(found["all"]) == set(found["layers"])
-    assert found["scales"] == 4
+    assert found["scales"] == 5
+    sample = loading.open(tiny)[0]
+    low, high = (getattr(sample["container/points"], end)(axis=0) for end in ("min", "max"))
+    cloud, goal, moved = np.array(found["middles"])
+    assert np.allclose(cloud, (low + high) / 2, atol=0.008)
+    assert np.allclose(goal, sample["pose/T_world_object_goal"][:3, 3], atol=1e-3)
+    assert np.allclose(moved, goal, atol=0.02), "the cloud of the object is moved to where the object stands"
     assert found["eyes"] == 4, "above, nearer, and back to the front"
     assert found["dark"] == "rgb(20, 24, 31)"
     assert found["wide"] <= 500, "nothing makes the page wider than the window"

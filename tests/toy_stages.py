@@ -2,7 +2,8 @@
 
 They take the place of `pipeline.STAGES` by name (`table="toy_stages"`). The variables TOY_SLEEP, TOY_CALLS and
 TOY_FAULT reach the workers through the environment: seconds a demo takes, a file that a line is added to for each call
-of a stage, and a fault such as "kill:7" or "kill:7:once" that happens at that demo.
+of a stage, and a fault such as "kill:7" that happens when that demo is observed; "kill:7:FILE" happens once and leaves that
+file. TOY_LABEL_FAULT is a fault that happens when the demo is labelled.
 """
 
 from __future__ import annotations
@@ -47,9 +48,9 @@ def called(name: str) -> None:
     time.sleep(float(os.environ.get("TOY_SLEEP", "0")))
 
 
-def misbehave(demo: int) -> None:
-    """What TOY_FAULT asks for at this demo."""
-    kind, at, *once = os.environ.get("TOY_FAULT", "none:-1").split(":")
+def misbehave(demo: int, variable: str = "TOY_FAULT") -> None:
+    """What TOY_FAULT, or another variable, asks for at this demo."""
+    kind, at, *once = os.environ.get(variable, "none:-1").split(":")
     if demo != int(at):
         return
     if once:
@@ -59,11 +60,14 @@ def misbehave(demo: int) -> None:
         mark.touch()
     if kind == "kill":
         os.kill(os.getpid(), signal.SIGKILL)
+    if kind == "kill_parent":
+        os.kill(os.getppid(), signal.SIGKILL)
+        time.sleep(1000)
     if kind == "abort":
         os.abort()
     if kind == "hang":
         time.sleep(1000)
-    if kind == "nan":
+    if kind in ("nan", "raise"):
         raise ValueError("a stage that failed")
     if kind == "leave":
         os._exit(3)
@@ -149,6 +153,7 @@ def cluster(made: Inputs, sections: Sections, draw: Draw) -> Superpoints | Rejec
 
 def label(made: Inputs, sections: Sections, draw: Draw) -> Labels:
     called("label")
+    misbehave(int(made["demonstrate"].demo), "TOY_LABEL_FAULT")
     points = made["cluster"].container_superpoint_points
     apart = np.linalg.norm(points - made["demonstrate"].T_world_object_goal[:3, 3], axis=1)
     return Labels(

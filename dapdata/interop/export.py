@@ -79,8 +79,9 @@ def choose(root: str | Path, split: str | None = None, demos: int | None = None)
 
     Raises:
         FormatError: if there is no labelled dataset.
-        UsageError: if there is no such split, or nothing in it.
+        UsageError: if there is no such split, or nothing in it, or `demos` is less than 1.
     """
+    _at_least_one("demos", demos)
     dataset = loading.open(root, split)
     owners = dataset.index["split"][:demos]
     if not len(owners):
@@ -89,8 +90,14 @@ def choose(root: str | Path, split: str | None = None, demos: int | None = None)
     return Chosen(dataset, {name: np.flatnonzero(owners == name) for name in order}, {"split": split, "demos": demos})
 
 
+def _at_least_one(name: str, value: int | None) -> None:
+    if value is not None and value < 1:
+        raise UsageError(f"{name}: got {value}, expected at least 1")
+
+
 def cut(chosen: Chosen, size: int) -> Iterator[tuple[str, list[Array]]]:
     """Each split with its demos in parts of `size`, the last one smaller."""
+    _at_least_one("shard_size", size)
     for name, numbers in chosen.splits.items():
         yield name, np.split(numbers, range(size, len(numbers), size))
 
@@ -120,7 +127,7 @@ def readme(chosen: Chosen, form: card.Form) -> dict[str, bytes]:
     """The dataset's card with what is particular to a format, and its pictures, by path."""
     dataset, found = chosen.dataset, chosen.dataset.manifest
     numbers = np.concatenate([*chosen.splits.values()])
-    pictures = {path: (dataset.root / path).read_bytes() for path in found.files if path.startswith(f"{manifest.PREVIEWS}/")}
+    pictures = dataset.files([path for path in found.files if path.startswith(f"{manifest.PREVIEWS}/")])
     text = card.render(
         found.model_copy(update={"shards": [], "stages": {}}).model_dump(mode="json"),
         {name: entry.spec for name, entry in found.stages.items() if entry.units},
@@ -197,16 +204,14 @@ def _about(export: Export) -> dict[str, Any]:
     return dict(json.loads(json.dumps(about)))
 
 
-def _refuse_inside(out: str | Path, target: Path, root: Path) -> None:
-    if target.resolve().is_relative_to(root.resolve()):
+def _refuse_inside(out: str | Path, target: Path, root: str | Path) -> None:
+    if target.resolve().is_relative_to(Path(root).resolve()):
         raise UsageError(f"{out}: in the dataset's own folder, expected a place outside of {root}; choose another with --out")
 
 
 def _is_there(out: str | Path, target: Path, about: Mapping[str, Any]) -> bool:
     """Whether the folder is this export; False if it is new or empty."""
-    if target.is_dir() and not any(target.iterdir()):
-        return False
-    if not target.exists() and not target.is_symlink():
+    if not target.exists() or (target.is_dir() and not any(target.iterdir())):
         return False
     found = _read_about(target)
     if found is None:
@@ -240,11 +245,12 @@ def _has_size(path: Path, size: int) -> bool:
 
 def _refuse_foreign(partial: Path) -> None:
     """Refuses to clear what somebody else may have put under the name of an unfinished export."""
-    ours = (".lock", durable.STAGING)
-    if partial.exists() and _read_about(partial) is None:
-        others = [path for path in partial.iterdir() if path.name not in ours and not path.match(durable.TEMPORARY)]
-        if others or not partial.is_dir():
-            raise UsageError(f"{partial}: exists and is no unfinished export, but that name is needed; move it away")
+    known = (".lock", durable.STAGING)
+    others = partial.exists() and not partial.is_dir()
+    if partial.is_dir() and _read_about(partial) is None:
+        others = any(path.name not in known and not path.match(durable.TEMPORARY) for path in partial.iterdir())
+    if others:
+        raise UsageError(f"{partial}: exists and is no unfinished export, expected that name to be free; move it away")
 
 
 def _start(partial: Path, about: Mapping[str, Any]) -> None:
@@ -286,6 +292,6 @@ def _finish(partial: Path, target: Path, about: Mapping[str, Any]) -> None:
     }
     text = json.dumps({**about, "files": files}, indent=1, sort_keys=True) + "\n"
     durable.replace_file(partial / ABOUT, text.encode())
-    if not durable.commit(partial, target):
+    if not durable.move(partial, target):  # every piece was fsynced when it was committed
         raise FormatError(f"{target}: was made by somebody else meanwhile, expected to be free; choose another with --out")
     (target / ".lock").unlink()

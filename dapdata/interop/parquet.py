@@ -31,7 +31,7 @@ from dapdata.records import Array
 SHARD_SIZE = 1000  # demos in a file
 ROWS = 32  # in a row group: 4 to 30 MB
 PREVIEW = "preview"
-PANEL = 256, 224  # px, of each half of a preview
+PANEL = 192, 168  # px, of each half of a preview
 
 
 def export(
@@ -77,8 +77,9 @@ def _form(chosen: Chosen) -> Form:
     return Form(
         files=(
             "`data/` holds one row per demo: what is known of it; `preview` (left: the affordance on the observed cloud, red "
-            "where to place; right: the true scene with all goals, the demonstrated one orange); and a column for each array "
-            "below, rows of points and poses as nested lists. `export.json` names every file with its sha256."
+            "where to place; right: the true scene with all goals, the demonstrated one orange, rejected ones faint); and "
+            "a column for each array below, rows of points and poses as nested lists. `export.json` names every file with its "
+            "sha256."
         ),
         loader=f"""```python
 from datasets import load_dataset
@@ -86,7 +87,7 @@ demos = load_dataset("parquet", data_files="data/{next(iter(chosen.splits))}-*.p
 points, goals = demos[0]["container/points"], demos[0]["goals/T_world_object"]
 ```
 """,
-        configs=f"- config_name: default\n  data_files:\n{splits}",
+        header=f"configs:\n- config_name: default\n  data_files:\n{splits}",
     )
 
 

@@ -263,7 +263,7 @@ def data_of(run: str | Path | None) -> str | Path:
         raise FormatError(
             f"{run}/config.json: does not say on which data the run was trained; give them with --data"
         ) from error
-    if not Path(named).is_dir():
+    if "://" not in str(named) and not Path(named).is_dir():
         raise UsageError(f"{run}: its dataset {named} is not there; say where it is with --data")
     return str(named)
 
@@ -271,7 +271,7 @@ def data_of(run: str | Path | None) -> str | Path:
 def _folder(run: str | Path | None, method: str, dataset: Dataset, changes: Mapping[str, Any]) -> Path:
     """Where a report goes if nobody says: with changes not into the run, whose own report it is not."""
     if not changes:
-        return Path(run or Path("runs") / f"{method}-{dataset.root.resolve().name}")
+        return Path(run or Path("runs") / f"{method}-{Path(dataset.root).resolve().name}")
     assert run is not None, "what has no run has nothing to change"
     words = [word for name, value in changes.items() for word in (name, *(value if isinstance(value, list) else [value]))]
     beside = Path(run).resolve()

@@ -277,14 +277,16 @@ def fit(
     keep_metrics(run, name, progress.step)
     logged: list[dict[str, float]] = []
     saved = time.monotonic()
+    share = budget.share(progress.step)  # asked for once a step: time that passes in between must not end it half-way
     with progress_bar(name, budget) as show:
-        while (share := budget.share(progress.step)) < 1 or progress.step == 0:
+        while share < 1 or progress.step == 0:
             rate = learning_rate(config, progress.step, share)
             logged.append(train_step(network, optimizer, material, config, progress.step, rate, device))
             progress.step += 1
             update_average(average, network, min(config.ema, 1 - 1 / (1 + AVERAGED_SHARE * progress.step)))
             progress.seconds = budget.spent()
-            last = budget.share(progress.step) >= 1
+            share = budget.share(progress.step)
+            last = share >= 1
             if stop is not None and stop.is_set():
                 save_state(run, network, optimizer, average, progress)
                 return progress

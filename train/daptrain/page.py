@@ -52,12 +52,16 @@ GEOMETRY_ROWS = {
     "push_N": "largest push while moving in, N",
 }
 TRAINING = {  # of both networks: what their log calls it, how it is named, in which unit
-    "affordance": {"loss": ("loss", ""), "val_iou": ("overlap with the best mode", "IoU"), "val_valid": ("valid", "share")},
+    "affordance": {
+        "loss": ("loss", ""),
+        "val_iou": ("denoised and demonstrated region", "IoU"),
+        "val_valid": ("samples that are the region of one goal", "share"),
+    },
     "pose": {
         "loss": ("loss", ""),
-        "off_mm": ("off in training", "mm"),
-        "val_moved_mm": ("moved while settling", "mm"),
-        "val_turned_deg": ("turned while settling", "°"),
+        "off_mm": ("off the goal", "mm"),
+        "val_moved_mm": ("off the goal", "mm, median"),
+        "val_turned_deg": ("turned from the goal", "°, median"),
     },
 }
 
@@ -309,6 +313,7 @@ def _scenes(report: Report, material: Material, in_view: Sequence[int]) -> str:
         return [None if v is None else scale * float(getattr(v, name)) for v in top]
 
     rows = report.scenes
+    overlap = [None if v is None else 1000 * max(v.penetration, 0.0) for v in top]
     free = [None if g < 0 else 1000 * float(r.clearance[g]) for r, g in zip(material.results, goal)]
     off = [None if g < 0 else 1000 * float(r.distance[0, g]) for r, g in zip(material.results, goal)]
     columns = [
@@ -319,7 +324,7 @@ def _scenes(report: Report, material: Material, in_view: Sequence[int]) -> str:
         Column("found", "goals found", [row.modes_found for row in rows], f"by {report.method.draws} candidates"),
         Column("off", "nearest goal, mm off", off, "surface distance of the best-ranked candidate", digits=1),
         Column("clearance", "its free play, mm", free, "clearance of that goal", digits=1),
-        Column("overlap", "overlap, mm", figures("penetration", 1000), "at the predicted pose", digits=1),
+        Column("overlap", "overlap, mm", overlap, "at the predicted pose", digits=1),
         Column("moved", "moved, mm", figures("moved", 1000), "from the prediction to where it came to rest", digits=1),
         Column("turned", "turned, °", figures("turned", 180 / np.pi), "while settling", digits=1),
         Column("push", "push, N", figures("push"), "largest while moving in", digits=1),

@@ -105,6 +105,19 @@ def test_a_split_that_leaks_is_found(toy_copy: Path, tmp_path: Path) -> None:
     assert any("is in test and train" in problem for problem in health.verify(toy_copy).problems)
 
 
+@pytest.mark.parametrize("change", ["another digest", "a row less", "a row more"])
+def test_an_index_that_tells_of_other_demos_is_found(toy_copy: Path, tmp_path: Path, change: str) -> None:
+    index = manifest.read_index(toy_copy)
+    rows = [dict(zip(index, values)) for values in index.stream(list(index))]
+    if change == "another digest":
+        rows[2]["sha256"] = "0" * 64
+    rows = rows[:-1] if change == "a row less" else [*rows, *rows[-1:]] if change == "a row more" else rows
+    with tables.writer(tmp_path / "index.parquet") as other:
+        other.add(rows)
+    manifest.publish(toy_copy, manifest.read(toy_copy), {"index.parquet": tmp_path / "index.parquet", "README.md": b""})
+    assert "index.parquet: its rows are not the demos of the shards" in health.verify(toy_copy).problems
+
+
 def test_a_content_digest_that_is_wrong_is_found(toy_copy: Path) -> None:
     tree = json.loads((toy_copy / "manifest.json").read_text())
     (toy_copy / "manifest.json").write_text(json.dumps(tree | {"content_sha256": "0" * 64}))

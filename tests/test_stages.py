@@ -122,6 +122,12 @@ def test_no_instance_is_in_two_splits() -> None:
         assert all(len(names) == 1 for names in owners.values())
 
 
+def test_distinct_instances_are_named_once_and_ascending() -> None:
+    values = np.array([5, 3, 5, -1, 3, 3], dtype=np.int64)
+    assert split.distinct(values).tolist() == [-1, 3, 5]
+    assert split.distinct(values[:0]).tolist() == []
+
+
 def test_a_demo_between_two_splits_is_unused() -> None:
     wishes = list(islice(split.wanted(SHARES, 1), 10))
     train, test = wishes.index("train"), wishes.index("test")

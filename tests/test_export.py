@@ -457,7 +457,7 @@ def test_a_crash_at_any_rename_leaves_no_export_and_the_next_run_goes_on(
         files = [path for path in partial.rglob("*") if path.suffix in SUFFIXES and durable.STAGING not in path.parts]
         before, there = there, {path: path.stat().st_mtime_ns for path in files}
         assert before.items() <= there.items(), "what was there is not made again"
-    assert last > 5
+    assert last >= 4  # a run goes on where the one before it was, so each gets further by more than one
     assert len(there) >= 2
     assert content(out) == whole
     assert not partial.exists()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import json
 import os
@@ -456,7 +457,7 @@ def test_a_crash_at_any_rename_leaves_no_export_and_the_next_run_goes_on(
         files = [path for path in partial.rglob("*") if path.suffix in SUFFIXES and durable.STAGING not in path.parts]
         before, there = there, {path: path.stat().st_mtime_ns for path in files}
         assert before.items() <= there.items(), "what was there is not made again"
-    assert last >= 5
+    assert last >= 4  # a run goes on where the one before it was, so each gets further by more than one
     assert len(there) >= 2
     assert content(out) == whole
     assert not partial.exists()
@@ -535,9 +536,11 @@ def test_nothing_takes_its_name_before_it_is_on_the_disk(tiny: Path, tmp_path: P
 
 
 def test_demos_in_no_split_have_files_of_their_own(tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    dataset = export.choose(tiny).dataset
-    dataset.index["split"][4] = "unused"
-    monkeypatch.setattr(loading, "open", lambda root, split: dataset)
+    chosen = export.choose(tiny)
+    owners = chosen.dataset.index["split"].astype("<U6")
+    owners[4] = "unused"
+    other = dataclasses.replace(chosen.dataset, index={**chosen.dataset.index, "split": owners})
+    monkeypatch.setattr(loading, "open", lambda root, split: other)
     assert export.choose(tiny).splits["unused"].tolist() == [4]
     out = webdataset.export(tiny, tmp_path / "out")
     assert (out / "unused-000000.tar").is_file()

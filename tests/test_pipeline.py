@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import subprocess
+import sys
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
@@ -236,9 +238,14 @@ def test_status_says_who_works(toy_copy: Path) -> None:
 
 @pytest.mark.slow
 def test_memory_is_flat_in_the_number_of_demos(tmp_path: Path) -> None:
+    """In a process of its own: workers begin with the memory of the one that forks them, whatever it imported before."""
+    make = "import sys, pathlib, conftest; conftest.make_toy(pathlib.Path(sys.argv[1]), int(sys.argv[2]), 10, engine='local')"
+    path = os.pathsep.join([str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")])
     peaks = []
     for demos in (10, 300):
-        root = make_toy(tmp_path / str(demos), demos, shard_size=10, engine="local")
+        root = tmp_path / str(demos)
+        command = [sys.executable, "-c", make, root, str(demos)]
+        subprocess.run(command, check=True, env=os.environ | {"PYTHONPATH": path})
         peaks.append(health.status(root).to_dict()["peak_mb"])
     assert peaks[1] - peaks[0] < 50
     assert max(peaks) < 600

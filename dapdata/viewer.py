@@ -1,8 +1,8 @@
 """The 3-D view of demos in a page: clouds, goals, correspondences, true parts, cameras, each to be switched on and off.
 
 What is in a view is decided here, as layers of three kinds; `viewer.js` makes plotly's traces of them. Clouds travel as
-16-bit steps within their box (of a few hundredths of a millimetre), normals and colours as 8-bit numbers: 15 bytes a point,
-20 in base64. A point becomes a small hexagon that lies in its tangent plane, so that surfaces close and catch light.
+16-bit steps within their box (of a few hundredths of a millimetre), normals and colours as 8-bit numbers: 14 bytes a point,
+19 in base64. A point becomes a small hexagon that lies in its tangent plane, so that surfaces close and catch light.
 Solids travel once and are repeated by the page at each of their poses.
 """
 

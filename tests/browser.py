@@ -27,7 +27,7 @@ FLAGS = (
     "--disable-component-update --disable-sync --use-gl=angle --use-angle=swiftshader --enable-unsafe-swiftshader "
     "--hide-scrollbars --virtual-time-budget=60000"
 )
-PATIENCE = 300  # s
+PATIENCE = 600  # s: a busy machine draws 3-D in software very slowly
 COLLECT = """<script>
 const problems = [], requests = [];
 addEventListener("error", e => problems.push(String(e.message)));

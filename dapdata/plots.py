@@ -36,6 +36,7 @@ Array = NDArray[Any]
 BINS = 24  # of a histogram
 BAR = "#4787a3"
 COLORS = ("var(--mine)", "#4787a3", "#8172b3", "#8c8c8c", "#b5782d", "#55a868")  # of methods; the first is the report's own
+DASHED = {"color": "var(--ink)", "width": 1, "dash": "dot"}
 AXIS = {
     "gridcolor": "var(--rule)",
     "linecolor": "var(--rule)",
@@ -120,9 +121,6 @@ def histogram(values: Array, height: int = 150) -> Figure:
     )
 
 
-DASHED = {"color": "var(--ink)", "width": 1, "dash": "dot"}
-
-
 def text(name: str) -> str:
     """A name as plotly's text, which would take tags in it for its own."""
     return escape(name.replace("_", " "), quote=False)
@@ -163,7 +161,7 @@ def bars(counts: Mapping[str, int], *more: tuple[str, Mapping[str, int]], name: 
             for i, (label, row) in enumerate(series)
         ),
         xaxis={"visible": False, "range": [0, most * 1.18]},
-        yaxis={"autorange": "reversed", "ticklabelstandoff": 6, "showgrid": False},
+        yaxis={"type": "category", "autorange": "reversed", "ticklabelstandoff": 6, "showgrid": False},
         bargap=0.3,
         margin={"t": 4, "r": 30},
     )

@@ -41,12 +41,11 @@ document.addEventListener("plotting", () => {
   // ---- layers -> traces
   const colour = () => document.querySelector("input[name=colour]:checked").value;
   const isShown = layer => switched[layer.name] ?? layer.on;
-  const light = () => ({ lightposition: Object.fromEntries(["x", "y", "z"].map((axis, a) => [axis, 1e4 * view.light[a]])) });
   const MATT = { ambient: 0.82, diffuse: 0.5, specular: 0.02, roughness: 0.9, fresnel: 0.02, facenormalsepsilon: 0, vertexnormalsepsilon: 0 };
   const made = { // what a layer looks like does not change while its demo is shown, so it is made once
-    cloud: layer => ({ type: "mesh3d", ...hexagons(view.clouds[layer.cloud], layer.T), hoverinfo: "skip", lighting: MATT, ...light() }),
+    cloud: layer => ({ type: "mesh3d", ...hexagons(view.clouds[layer.cloud], layer.T), hoverinfo: "skip", lighting: MATT }),
     solid: layer => ({ type: "mesh3d", ...repeated(view.solids[layer.solid], layer.poses, layer.says), color: layer.color, opacity: layer.opacity,
-      flatshading: true, lighting: MATT, ...light(), hovertemplate: "%{text}<extra></extra>" }),
+      flatshading: true, lighting: MATT, hovertemplate: "%{text}<extra></extra>" }),
     lines: layer => {
       const ends = numbers(layer.ends, Float32Array), at = a => Array.from({ length: ends.length / 2 }, (_, i) => i % 3 === 2 ? null : ends[6 * Math.floor(i / 3) + 3 * (i % 3) + a]);
       return { type: "scatter3d", mode: "lines", x: at(0), y: at(1), z: at(2), line: { color: layer.color, width: 2 }, connectgaps: false,
@@ -54,11 +53,10 @@ document.addEventListener("plotting", () => {
     },
   };
   const coloured = layer => {
-    const values = view.clouds[layer.cloud].values[colour()];
-    if (!values) return { color: colours.find(c => c.name === "plain").scale[0][1], lighting: { ...MATT, ambient: 0.45, diffuse: 0.8 } }; // light alone tells the shape
-    const small = bytes(values), intensity = new Float32Array(6 * small.length);
+    const { values } = view.clouds[layer.cloud], name = values[colour()] ? colour() : "plain";
+    const small = bytes(values[name]), intensity = new Float32Array(6 * small.length);
     for (let v = 0; v < intensity.length; v++) intensity[v] = small[Math.floor(v / 6)] / 255;
-    return { intensity, colorscale: colours.find(c => c.name === colour()).scale, cmin: 0, cmax: 1, showscale: false };
+    return { intensity, colorscale: colours.find(c => c.name === name).scale, cmin: 0, cmax: 1, showscale: false };
   };
   function traces() {
     return view.layers.map(layer => {

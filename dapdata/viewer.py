@@ -1,8 +1,8 @@
 """The 3-D view of demos in a page: clouds, goals, correspondences, true parts, cameras, each to be switched on and off.
 
 What is in a view is decided here, as layers of three kinds; `viewer.js` makes plotly's traces of them. Clouds travel as
-16-bit steps within their box (of a few hundredths of a millimetre), normals and colours as 8-bit numbers: 15 bytes a point,
-20 in base64. A point becomes a small hexagon that lies in its tangent plane, so that surfaces close and catch light.
+16-bit steps within their box (of a few hundredths of a millimetre), normals and colours as 8-bit numbers: 14 bytes a point,
+19 in base64. A point becomes a small hexagon that lies in its tangent plane, so that surfaces close and catch light.
 Solids travel once and are repeated by the page at each of their poses.
 """
 
@@ -44,7 +44,7 @@ FRUSTUM = 0.06  # m, length of a camera as drawn
 STEPS = 256  # of a scale of colours
 SECTIONS = 32  # sides of a cylinder
 GOALS = {"demonstrated goal": (DEMONSTRATED, 0.7), "other valid goals": (VALID, 0.6)}
-PLAIN = np.full((2, 3), 0.74)
+PLAIN = np.array([(0.38, 0.41, 0.46), (0.86, 0.88, 0.91)])  # in the dark and in the light
 CAMERA = (0.45, 0.45, 0.75)
 CORRESPONDENCE = (0.55, 0.35, 0.75)
 
@@ -77,7 +77,7 @@ def _colours() -> Iterator[dict[str, Any]]:
     yield described("height", "height (raw cloud)", height_colors(np.linspace(0, 1, 9), 1), ("0 m", ""))
     yield described("superpoint", "superpoint", superpoint_colors(STEPS), ("a colour each", ""))
     yield described("affordance", "affordance", DIVERGING, ("−1 keep away", "place here +1"))
-    yield described("plain", "plain", PLAIN, ("", ""))
+    yield described("plain", "plain", PLAIN, ("turned away", "to the light"))
     yield described("camera", "camera that saw it", superpoint_colors(STEPS)[:12], ("a colour each", ""))
 
 
@@ -111,8 +111,7 @@ def view(
         "extent": float(np.linalg.norm(high - low)),
         "reach": float(np.abs(_everywhere(sample) - (low + high) / 2).max()) + 0.1,
         "eye": (-front.T_world_camera[:3, 2]).tolist(),
-        "light": to_light(front).tolist(),
-        "clouds": {body: _cloud(sample, body, float(high[2]), most) for body in ("container", "object")},
+        "clouds": {body: _cloud(sample, body, float(high[2]), most, to_light(front)) for body in ("container", "object")},
         "solids": {name: _solid(triangles) for name, triangles in solids(sample, SECTIONS).items()},
         "layers": [*more, *layers(sample, goals)],
     }
@@ -210,7 +209,8 @@ def _everywhere(sample: Sample) -> Array:
     return np.concatenate([sample["container/points"], sample["object/points"], *(T[:, :3, 3] for T in poses)]).astype(float)
 
 
-def _cloud(sample: Sample, body: str, top: float, most: int) -> dict[str, Any]:
+def _cloud(sample: Sample, body: str, top: float, most: int, light: Array) -> dict[str, Any]:
+    """A cloud as it travels; colours of heights up to `top`, m, and of what faces (3,) `light`."""
     points = sample[f"{body}/points"].astype(float)
     keep = np.unique(np.linspace(0, len(points) - 1, min(len(points), most)).astype(int))
     low = points.min(axis=0)
@@ -218,6 +218,7 @@ def _cloud(sample: Sample, body: str, top: float, most: int) -> dict[str, Any]:
     superpoint = sample[f"{body}/superpoint"][keep]
     values = {
         "height": np.clip(points[keep, 2] / max(top, 1e-3), 0, 1) * (STEPS - 1),
+        "plain": np.clip(sample[f"{body}/normals"][keep] @ light, 0, 1) * (STEPS - 1),  # plotly's light is from above alone
         "superpoint": superpoint % STEPS,
         "camera": sample[f"{body}/view"][keep] % 12 * (STEPS - 1) / 11,
     }

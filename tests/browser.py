@@ -6,10 +6,12 @@ async function once the page is drawn, and what it returns comes back. 3-D views
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import re
 import shutil
+import signal
 import subprocess
 from html import unescape
 from pathlib import Path
@@ -25,6 +27,7 @@ FLAGS = (
     "--disable-component-update --disable-sync --use-gl=angle --use-angle=swiftshader --enable-unsafe-swiftshader "
     "--hide-scrollbars --virtual-time-budget=60000"
 )
+PATIENCE = 600  # s: a busy machine draws 3-D in software very slowly
 COLLECT = """<script>
 const problems = [], requests = [];
 addEventListener("error", e => problems.push(String(e.message)));
@@ -64,17 +67,22 @@ def open_page(html: str, folder: Path, script: str = "", fragment: str = "", wid
     page = folder / "opened.html"
     page.write_text(html.replace("<head>", f"<head>{COLLECT}", 1).replace("</body>", ACT % script + "</body>"), "utf-8")
     flags = [*FLAGS.split(), f"--window-size={width},900", f"--user-data-dir={folder / 'user'}", "--dump-dom"]
-    done = subprocess.run(
+    browser = subprocess.Popen(
         [str(CHROMIUM), *flags, f"file://{page}#{fragment}"],
-        capture_output=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
         text=True,
-        timeout=120,
         env=os.environ | {"HOME": str(folder)},
-        check=True,
+        start_new_session=True,  # so that its children can be ended with it
     )
+    try:
+        said, complained = browser.communicate(timeout=PATIENCE)
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(browser.pid, signal.SIGKILL)
     shutil.rmtree(folder / "user", ignore_errors=True)
-    found = re.search(r'<pre id="told">(.*?)</pre>', done.stdout, re.DOTALL)
-    assert found, done.stderr[-2000:]
+    found = re.search(r'<pre id="told">(.*?)</pre>', said, re.DOTALL)
+    assert found, complained[-2000:]
     told = json.loads(unescape(found[1]))
     assert told["problems"] == []
     assert told["requests"] == []

@@ -151,6 +151,9 @@ def test_a_view_holds_the_points_and_every_pose(sample: pictures.Sample) -> None
         points = np.array(cloud["low"]) + steps * np.array(cloud["step"])
         assert np.abs(points - sample[f"{body}/points"]).max() < 1e-4
         assert {len(base64.b64decode(values)) for values in cloud["values"].values()} == {len(points)}
+    score = np.frombuffer(base64.b64decode(view["clouds"]["container"]["values"]["affordance"]), "u1") / 127.5 - 1
+    wanted = sample["container_superpoints/affordance"][sample["container/superpoint"]]
+    assert np.allclose(score, wanted, atol=0.005)
     layers = {layer["name"]: layer for layer in view["layers"]}
     poses = np.array(layers["demonstrated goal"]["poses"] + layers["other valid goals"]["poses"])
     assert np.allclose(poses.reshape(-1, 3, 4), sample["goals/T_world_object"][:, :3], atol=1e-5)

@@ -229,6 +229,8 @@ def test_an_object_is_brought_in_against_the_approach_of_its_place():
     assert isinstance(demo, Demo)
     assert np.array_equal(demo.goal_approach, [[0, 0, 1], [1, 0, 0]])
     assert [verdict.reason for verdict in judge(demo, demo.goals, CONFIG)] == ["ok", "ok"]
+    nowhere = replace(scene, T_container_goal=np.zeros((0, 4, 4)), goal_approach=np.zeros((0, 3)))
+    assert settle(nowhere, scene.T_container_goal, CONFIG)[1] == ["unreachable", "ok"], "against the opening"
     swapped = replace(demo, goal_approach=demo.goal_approach[::-1])
     assert [verdict.reason for verdict in judge(swapped, demo.goals, CONFIG)] == ["pushed", "ok"]
 

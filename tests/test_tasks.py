@@ -16,7 +16,7 @@ import dapdata
 from dapdata import health, pipeline, recipe, rng, solids, tasks
 from dapdata.poses import inverse, pose, symmetric_distance
 from dapdata.records import GOAL_KINDS, REJECT_REASONS, ROLES, SYMMETRIES, Demo, Rejected, Scene
-from dapdata.simulate import HANG_SHIFT, PlacementConfig, demonstrate, judge
+from dapdata.simulate import HANG_SHIFT, PlacementConfig, demonstrate, judge, settle
 from dapdata.tabletop import TabletopConfig
 
 TASKS = tasks.names()
@@ -292,6 +292,15 @@ def test_mugs_hang_by_their_handle_to_either_side_of_each_peg():
             x, y, z = (inverse(peg) @ pose_ @ demo.T_object_part[handle])[:3, 3]
             assert np.hypot(x, y) < 0.03, "its outermost piece lies on the peg"
             assert abs(z) < 0.08
+
+
+def test_mugs_begin_clear_of_other_pegs():
+    params = tasks.load("mug_rack").Params(pegs=(2, 2), peg_angle_deg=(35.0, 70.0), peg_yaw_deg=(-40.0, 40.0))
+    drawn = [tasks.load("mug_rack").sample_scene(params, rng.stream(11, "pegs", i)) for i in range(6)]
+    reasons = [settle(scene, scene.T_container_goal, CONFIG)[1] for scene in drawn if isinstance(scene, Scene)]
+    counts = Counter(reason for several in reasons for reason in several)
+    assert counts["penetrates"] == 0
+    assert counts["ok"] >= 10
 
 
 def test_a_mug_that_stands_at_the_foot_of_its_rack_is_no_success():

@@ -448,18 +448,19 @@ class _World:
     """A simulation of one scene: fixed parts, a held copy of the object to measure with, and copies that fall."""
 
     def __init__(self, scene: Scene | Demo, config: PlacementConfig, exhaustive: bool = False) -> None:
+        self._opening = np.asarray(scene.opening, np.float64)
         self._places, self._ways_out = _places(scene), np.asarray(scene.goal_approach, np.float64)
-        self.hangs, self._opens_up = _hangs(scene), bool(scene.opening[2] > SUPPORTING)
+        self.hangs, self._opens_up = _hangs(scene), bool(self._opening[2] > SUPPORTING)
         self.max_tilt = float(scene.max_tilt)
         self.symmetry = SYMMETRIES[int(scene.symmetry_kind)]
         self._axis = np.asarray(scene.symmetry_axis, np.float64)
         self._exhaustive = exhaustive
         self._config = config
         self._object = tuple(np.asarray(x) for x in (scene.object_kind, scene.object_size, scene.T_object_part))
-        self._T_object_body = _object_body(*self._object)
         parts = tuple(np.asarray(x) for x in (scene.part_kind, scene.part_size, scene.T_container_part))
         for name, arrays in (("container part", parts), ("object part", self._object)):
             _check_solids(name, *arrays)
+        self._T_object_body = _object_body(*self._object)
         self._bounds = solids.bounds(*parts)  # (P, 2, 3)
         container = self._bounds[np.asarray(scene.part_role) == ROLES.index("container")]
         self._inside = np.stack([container[:, 0].min(axis=0), container[:, 1].max(axis=0)])
@@ -565,7 +566,9 @@ class _World:
         return found
 
     def way_out(self, T: Array) -> Array:
-        """(3,) unit vector out of the place nearest to an object at T, against which it is brought in."""
+        """(3,) unit vector out of the place nearest to an object at T, or, without places, out of the opening."""
+        if not len(self._places):
+            return self._opening
         return np.asarray(self._ways_out[np.linalg.norm(self._places - T[:3, 3], axis=1).argmin()])
 
     def free_height(self, T: Array) -> float:
@@ -598,12 +601,14 @@ class _World:
         return bool(np.all((point >= self._inside[0]) & (point <= self._inside[1])))
 
     def is_held(self, T: Array, contacts: Sequence[_Contact]) -> bool:
-        """Whether one of the contacts holds the object up; what hangs, from above its centre of mass.
+        """Whether one of the contacts holds the object up; what hangs, by touching it from above its centre of mass.
 
         A mug that stands at the foot of its rack does not hang.
         """
-        lowest = (T @ self._T_object_body)[2, 3] if self.hangs else -np.inf
-        return any(contact.normal[2] > SUPPORTING and contact.height > lowest for contact in contacts)
+        lowest, furthest = ((T @ self._T_object_body)[2, 3], TOUCH) if self.hangs else (-np.inf, np.inf)
+        return any(
+            contact.normal[2] > SUPPORTING and contact.height > lowest and contact.distance <= furthest for contact in contacts
+        )
 
     def difference(self, T_a: Array, T_b: Array) -> tuple[float, float]:
         """Distance (m) and angle (rad) between two poses modulo the object's symmetry."""

@@ -82,7 +82,8 @@ def build_scene(
     Args:
         params: The task's parameters.
         parts: Container and clutter, container frame.
-        object_parts: The object, in its own frame: origin at its bounding box's centre, z up at a goal.
+        object_parts: The object, in its own frame: origin at its bounding box's centre, z up at a goal (of what
+            hangs: when it stands).
         candidates: Every place where the object might stand; none makes the scene Rejected("no_free_slot").
         symmetry: One of records.SYMMETRIES.
         rng: Draws the poses.

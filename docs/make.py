@@ -57,8 +57,8 @@ integers are codes, `names`.
 
 Poses are 4x4 matrices; `T_a_b` maps b-coordinates to a: `p_a = T_a_b @ p_b`. The world frame is right-handed with z
 up and z = 0 on the table top. The container frame has z up and its origin at the centre of its footprint, on the
-underside. The object frame has its origin at the centre of the object's bounding box, and z up at a goal. Cameras
-have OpenCV axes: x right, y down, z ahead. There are no quaternions.
+underside. The object frame has its origin at the centre of the object's bounding box, and z up at a goal (of a mug,
+which hangs: when it stands). Cameras have OpenCV axes: x right, y down, z ahead. There are no quaternions.
 
 `schemas/shard.schema.json` says the same for machines: it describes {{path of each array: its zarr.json}}.
 """

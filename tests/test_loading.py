@@ -14,7 +14,7 @@ from toy_stages import toy_recipe
 import dapdata
 from dapdata import loading, pipeline, store
 from dapdata.errors import CorruptionError, FormatError, UsageError
-from dapdata.records import Cloud, Demo, Labels, Superpoints, read_record, to_sample
+from dapdata.records import LATER, Cloud, Demo, Labels, Superpoints, read_record, to_sample
 
 pytest.importorskip("torch")
 import torch
@@ -38,6 +38,16 @@ def test_samples_are_the_records_that_were_made(toy: Path) -> None:
     assert data[-1]["meta/demo"] == data[len(data) - 1]["meta/demo"]
     with pytest.raises(IndexError):
         data[len(data)]
+
+
+def test_what_early_datasets_do_not_hold_is_filled_in(tiny: Path) -> None:
+    for sample in dapdata.open(tiny):
+        early = {path: array for path, array in sample.items() if path not in LATER}
+        assert len(early) == len(sample) - 2
+        again = to_sample(read_record(Demo, early))
+        assert all(np.array_equal(again[path], sample[path]) for path in again)
+    with pytest.raises(KeyError, match="scene/opening"):
+        read_record(Demo, {path: array for path, array in early.items() if path != "scene/opening"})
 
 
 def test_splits_are_a_partition(toy: Path) -> None:

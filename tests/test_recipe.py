@@ -68,6 +68,30 @@ def test_each_kind_of_mistake_is_one_line_that_says_where_what_and_what_instead(
     assert complaint(tmp_path, SCENE + text) == [CASES[text]]
 
 
+IN_A_LIST = {
+    "- {task: can_cabinet, widht: [0.3, 0.4]}": "scene.scenes[0].widht: unknown key, did you mean 'width'?",
+    "- {task: can_cabinet, width: [0.4, 0.3]}": "scene.scenes[0].width: got [0.4, 0.3], expected [lowest, highest]",
+    "- {task: book_shelf}\n    - {task: vial_rack, clearance: 3}": (
+        "scene.scenes[1].clearance: got 3, expected a list of 2, each 0 to 2 m"
+    ),
+    "- {task: mixed}": "scene.scenes[0]: got a section, expected a section with `task:` one of ",
+    "- {start: any}": "scene.scenes[0]: got a section, expected a section with `task:` one of ",
+}
+
+
+@pytest.mark.parametrize("text", IN_A_LIST)
+def test_a_mistake_in_a_list_of_scenes_is_told_where_it_is(text: str, tmp_path: Path) -> None:
+    (line,) = complaint(tmp_path, f"scene:\n  task: mixed\n  scenes:\n    {text}\n")
+    assert line.startswith(f"x.yaml:{4 + text.count(chr(10))}: {IN_A_LIST[text]}")
+
+
+def test_shares_of_a_split_may_be_the_whole_and_no_more(tmp_path: Path) -> None:
+    whole = recipe.load(write(tmp_path, SCENE + "split: {val: 0.0, test: 1.0}"))
+    assert whole.split.test == 1
+    (line,) = complaint(tmp_path, SCENE + "split: {val: 0.3, test: 0.8}")
+    assert line == "x.yaml:3: split: test: got 0.8 beside val 0.3, expected no more than 1 together; lower one"
+
+
 @pytest.mark.parametrize(
     ("text", "start"),
     [

@@ -229,17 +229,19 @@ def test_an_object_is_brought_in_against_the_approach_of_its_place():
     assert isinstance(demo, Demo)
     assert np.array_equal(demo.goal_approach, [[0, 0, 1], [1, 0, 0]])
     assert [verdict.reason for verdict in judge(demo, demo.goals, CONFIG)] == ["ok", "ok"]
+    nowhere = replace(scene, T_container_goal=np.zeros((0, 4, 4)), goal_approach=np.zeros((0, 3)))
+    assert settle(nowhere, scene.T_container_goal, CONFIG)[1] == ["unreachable", "ok"], "against the opening"
     swapped = replace(demo, goal_approach=demo.goal_approach[::-1])
     assert [verdict.reason for verdict in judge(swapped, demo.goals, CONFIG)] == ["pushed", "ok"]
 
 
-def ring_on_a_peg(turn_deg: float, kind: str = "peg", aside: float = 0.0) -> Scene:
-    """A square ring around a level peg, turned about it; the way out is along the peg."""
+def ring_on_a_peg(turn_deg: float, kind: str = "peg", aside: float = 0.0, radius: float = 0.005) -> Scene:
+    """A square ring (its hole is 4 cm wide) around a level peg, turned about it; the way out is along the peg."""
     ring = [box((0.01, 0.06, 0.01), (0, 0, side * 0.025)) for side in (-1, 1)]
     ring += [box((0.01, 0.01, 0.04), (0, side * 0.025, 0)) for side in (-1, 1)]
-    peg = cylinder(0.005, 0.3, (0, 0, 0.15), rotation=rotation_about((0, 1, 0), np.pi / 2))
+    peg = cylinder(radius, 0.3, (0, 0, 0.15), rotation=rotation_about((0, 1, 0), np.pi / 2))
     turn = rotation_about((1, 0, 0), np.radians(turn_deg))
-    T = pose(turn, np.array([0, aside, 0.1555]) - turn @ [0, 0, 0.02])  # its upper bar on the peg
+    T = pose(turn, np.array([0, aside, 0.1505 + radius]) - turn @ [0, 0, 0.02])  # its upper bar on the peg
     scene = make_scene([T], [peg], ring, "none", max_tilt=np.pi)
     return replace(scene, goal_kind=np.array([GOAL_KINDS.index(kind)], np.uint8))
 
@@ -271,6 +273,8 @@ def test_a_ring_is_lifted_no_higher_than_its_peg_lets_it():
     demo = demonstrate(ring_on_a_peg(0), CONFIG, rng.stream(0, "test", 0))
     assert isinstance(demo, Demo)
     assert judge(demo, demo.goals, CONFIG)[0].success
+    thick = demonstrate(ring_on_a_peg(0, radius=0.017), CONFIG, rng.stream(0, "test", 0))
+    assert isinstance(thick, Demo), "6 mm of play: lifted by 10 mm, it would push against the peg from below"
     across = replace(demo, goal_approach=np.array([[0.0, 1, 0]]))
     assert judge(across, demo.goals, CONFIG)[0].reason == "pushed", "through the peg"
 

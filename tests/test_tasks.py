@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import fields
+from dataclasses import fields, replace
 from functools import cache
 from itertools import combinations
 from pathlib import Path
@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from dapdata import recipe, rng, solids, tasks
+import dapdata
+from dapdata import health, pipeline, recipe, rng, solids, tasks
 from dapdata.poses import inverse, pose, symmetric_distance
 from dapdata.records import GOAL_KINDS, REJECT_REASONS, ROLES, SYMMETRIES, Demo, Rejected, Scene
-from dapdata.simulate import HANG_SHIFT, PlacementConfig, demonstrate, judge
+from dapdata.simulate import HANG_SHIFT, PlacementConfig, demonstrate, judge, settle
 from dapdata.tabletop import TabletopConfig
 
 TASKS = tasks.names()
@@ -217,13 +218,139 @@ def test_recipes_give_demonstrations(path):
     assert path.read_text().startswith("# yaml-language-server: $schema=")
 
 
-# What is particular to the two tasks
+# What is particular to single tasks
 
 
 @pytest.mark.parametrize("task", ["can_cabinet", "book_shelf"])
 def test_containers_that_hold_nothing_are_refused(task):
     with pytest.raises(ValidationError, match=r"expected .* m or more"):
         tasks.load(task).Params(width=(0.01, 0.02))
+
+
+WRONG = {  # each task's smallest container that holds nothing, or a value that makes no sense
+    "dish_rack": ({"rail_height": (0.005, 0.01)}, {"clearance": (0.0, 0.01)}, {"plate_radius": (0.05, 0.06)}),
+    "fruit_rack": ({"height": (0.01, 0.02)}, {"hole": (0.2, 0.5)}, {"occupied": (0, 4)}, {"flatness": (0.3, 0.9)}),
+    "mug_rack": (
+        {"handle_depth": (0.01, 0.012)},
+        {"peg_angle_deg": (20.0, 50.0)},
+        {"racks": (1, 3), "rack_spacing": (0.1, 0.2)},
+    ),
+    "vial_rack": ({"pitch": (0.02, 0.03)}, {"clearance": (0.0, 0.001)}, {"height": (0.01, 0.02)}),
+}
+
+
+@pytest.mark.parametrize(("task", "wrong"), [(task, wrong) for task, several in WRONG.items() for wrong in several])
+def test_racks_that_hold_nothing_are_refused(task, wrong):
+    with pytest.raises(ValidationError, match=r"(got .* expected|expected .* or more)"):
+        tasks.load(task).Params(**wrong)
+
+
+def test_a_vial_has_its_clearance_on_each_side_and_every_free_hole_is_a_goal():
+    params = tasks.load("vial_rack").Params(clearance=(0.003, 0.003), occupancy=(0.0, 0.5))
+    for i in range(4):
+        scene = tasks.load("vial_rack").sample_scene(params, rng.stream(11, "vials", i))
+        assert len(scene.T_container_goal) + (scene.part_role == ROLES.index("clutter")).sum() == 14
+        parts = (scene.part_kind, scene.part_size, scene.T_container_part)
+        around = (scene.part_kind, scene.part_size, solids.bounds(*parts))
+        for T, clearance in zip(scene.T_container_goal, scene.goal_clearance):
+            vial = solids.cylinder(scene.object_size[0, 0] / 2, scene.object_size[0, 2], T[:3, 3])
+            assert solids.free_play(vial, *around) == pytest.approx(clearance) == pytest.approx(0.006)
+
+
+def test_vials_of_the_least_clearance_go_in():
+    module = tasks.load("vial_rack")
+    scene = module.sample_scene(module.Params(clearance=(0.001, 0.001)), rng.stream(11, "vials", 0))
+    demo = demonstrate(scene, CONFIG, rng.stream(11, "choice", 0))
+    assert isinstance(demo, Demo)
+    assert len(demo.rejected_goals) == 0
+    aside = demo.goals @ pose(None, (0.004, 0, 0))
+    assert {verdict.reason for verdict in judge(demo, aside, CONFIG)} == {"pushed"}
+
+
+def test_plates_lean_in_gaps_that_take_them_and_narrow_gaps_are_no_goals():
+    for scene in scenes("dish_rack"):
+        thickness, prongs = scene.object_size[0, 2], scene.part_size[:, 2] > 0.05
+        prongs &= (scene.part_kind == solids.CYLINDER) & (scene.part_role == ROLES.index("container"))
+        places, radius = np.unique(scene.T_container_part[prongs, 1, 3].round(6)), scene.part_size[prongs][0, 0] / 2
+        gaps = np.diff(places) - 2 * radius
+        wide = (places[:-1] + places[1:])[gaps > thickness] / 2
+        plates = scene.T_container_part[scene.part_role == ROLES.index("clutter"), 1, 3]
+        goals = scene.T_container_goal[:, 1, 3]
+        assert np.allclose(np.sort([*plates, *goals]), wide, atol=1e-5)
+    assert any((np.diff(np.sort(scene.T_container_goal[:, 1, 3])) > 0.03).any() for scene in scenes("dish_rack"))
+
+
+def test_mugs_hang_by_their_handle_to_either_side_of_each_peg():
+    for demo in demos("mug_rack"):
+        assert len(demo.goals) == 2
+        T = inverse(demo.T_world_container) @ demo.goals
+        assert (T[:, 2, 0] > 0.7).all(), "the handle is on top"
+        assert T[0, :3, 2] @ T[1, :3, 2] < 0, "and the opening to the one side, or to the other"
+        handle = demo.T_object_part[:, 0, 3].argmax()
+        for pose_ in T:
+            peg = demo.T_container_part[demo.part_kind == solids.CYLINDER][-1]
+            x, y, z = (inverse(peg) @ pose_ @ demo.T_object_part[handle])[:3, 3]
+            assert np.hypot(x, y) < 0.03, "its outermost piece lies on the peg"
+            assert abs(z) < 0.08
+
+
+def test_mugs_begin_clear_of_other_pegs():
+    params = tasks.load("mug_rack").Params(pegs=(2, 2), peg_angle_deg=(35.0, 70.0), peg_yaw_deg=(-40.0, 40.0))
+    drawn = [tasks.load("mug_rack").sample_scene(params, rng.stream(11, "pegs", i)) for i in range(6)]
+    reasons = [settle(scene, scene.T_container_goal, CONFIG)[1] for scene in drawn if isinstance(scene, Scene)]
+    counts = Counter(reason for several in reasons for reason in several)
+    assert counts["penetrates"] == 0
+    assert counts["ok"] >= 10
+
+
+def test_a_mug_that_stands_at_the_foot_of_its_rack_is_no_success():
+    params = tasks.load("mug_rack").Params(foot_probability=1.0, plate_side=(0.2, 0.2), disc_radius=(0.1, 0.1))
+    scene = tasks.load("mug_rack").sample_scene(params, rng.stream(11, "foot", 0))
+    demo = demonstrate(scene, CONFIG, rng.stream(11, "choice", 0))
+    assert isinstance(demo, Demo)
+    foot = solids.bounds(demo.part_kind[:1], demo.part_size[:1], demo.T_container_part[:1])[0]
+    mug = solids.bounds(demo.object_kind, demo.object_size, demo.T_object_part)
+    z = foot[1, 2] - mug[:, 0, 2].min() + 0.0005
+    standing = pose(None, (foot[0, 0] - mug[:, 0, 0].min() + 0.005, foot[0, 1] - mug[:, 0, 1].min() + 0.005, z))
+    upwards = replace(demo, goal_approach=np.tile([0.0, 0, 1], (len(demo.goals), 1)))
+    assert judge(upwards, demo.T_world_container @ standing[None], CONFIG)[0].reason == "not_touching"
+
+
+def test_a_mixture_draws_each_of_its_scenes_with_its_own_keys():
+    module = tasks.load("mixed")
+    params = recipe.from_resolved(
+        {"scene": {"task": "mixed", "scenes": [{"task": "can_cabinet", "shelves": [1, 1]}, {"task": "vial_rack"}]}}
+    ).scene
+    drawn = [module.sample_scene(params, rng.stream(11, "mixed", i)) for i in range(12)]
+    kinds = {scene.task: GOAL_KINDS[scene.goal_kind[0]] for scene in drawn}
+    assert set(kinds) == {0, 1}
+    assert kinds[1] == "hole"
+    for i, scene in enumerate(drawn):
+        draw = rng.stream(11, "mixed", i)
+        draw.integers(2)
+        alone = tasks.load(params.scenes[scene.task].task).sample_scene(params.scenes[scene.task], draw)
+        assert bytes_of(replace(alone, task=scene.task)) == bytes_of(scene)
+
+
+def test_a_dataset_of_a_mixture_says_of_which_task_each_demo_is(tmp_path):
+    small = [
+        "demos=10",
+        "shard_size=5",
+        "cameras.width=120",
+        "cameras.height=90",
+        "superpoints.count=64",
+        "split.val=0.2",
+        "split.test=0.2",
+    ]
+    read = recipe.load(next(path for path in RECIPES if path.stem == "mixed"), small)
+    root = pipeline.label(pipeline.generate(read, tmp_path / "mixed", engine="inline"), engine="inline")
+    dataset = dapdata.open(root)
+    named = [read.scene.scenes[int(sample["meta/task"])].task for sample in dataset]
+    assert named == dataset.index["task"].tolist()
+    assert set(named) == {"book_shelf", "can_cabinet"}
+    assert [GOAL_KINDS[sample["goals/kind"][0]] == "gap" for sample in dataset] == [name == "book_shelf" for name in named]
+    assert len(set(dataset.index["split"])) == 3
+    assert health.verify(root).ok
 
 
 def sizes_of(scene: Scene, role: str) -> np.ndarray:

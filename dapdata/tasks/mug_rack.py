@@ -5,9 +5,10 @@ down to the pole and swings until it hangs still: that is for the simulator to s
 object comes in along the peg. Pegs that are too thick for the handle, or too low for the mug to hang clear of the table, are
 no candidates.
 
-Source: RPDiff's racks (`syn_rack_cfg.py`, `syn_rack_gen.py`): radii, lengths, angles, yaws, feet and the three tiers. Not as
-there: pegs begin higher (its mugs may hang through the table, which takes no part in its simulation), none is steeper than
-35 degrees from the pole (a steeper one holds by its side, which is no support), and racks are not scaled.
+Source: RPDiff's racks (`syn_rack_cfg.py`, `syn_rack_gen.py`): the three tiers, radii, lengths, angles and yaws of pegs, feet.
+Not as there: racks are not scaled, and poles are as high as its racks are once scaled; pegs begin higher (its mugs may hang
+through the table, which takes no part in its simulation); none is steeper than 35 degrees from the pole (a steeper one holds
+by its side, which is no support); racks of every tier may have a foot. Its mugs are scanned ones; these are drawn.
 """
 
 from __future__ import annotations

@@ -210,7 +210,9 @@ def demos_used(train_split: Dataset, config: TrainConfig) -> int:
     """
     held = len(train_split)
     if held == 0:
-        raise UsageError(f"{train_split.root}: the train split holds no demo, expected at least 1; generate more demos")
+        raise UsageError(
+            f"{train_split.root}: the train split holds no demo, expected at least 1; generate more demos, or lower split.test"
+        )
     if config.demos is not None and config.demos > held:
         raise UsageError(
             f"train.demos: got {config.demos}, the train split of {train_split.root} holds {held}; ask for at most that many"

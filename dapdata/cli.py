@@ -422,6 +422,9 @@ def evaluate(
         list[str] | None,
         _option("--set", help="Override of a train key that acts at inference (--curve: of any)", metavar="KEY=VALUE"),
     ] = None,
+    fast: Annotated[
+        bool, typer.Option("--fast", help="Few steps of sampling (train.sample_steps=3): quicker, a little less accurate.")
+    ] = False,
     curve: Annotated[
         str | None,
         _option("--curve", help="Train anew on so many demos each, such as 10,20,40, and judge them all", metavar="N,N,..."),
@@ -443,11 +446,14 @@ def evaluate(
     as_json: Json = False,
 ) -> None:
     """Predict on a split, then judge in physics. Writes predictions.npz, report.json, report.html, pictures of failures."""
+    from dapdata.config import FAST
     from daptrain import evaluate as evaluate_run
     from daptrain.checkpoint import read_description
 
     judging: dict[str, Any] = {"split": split, "trials": trials, "protocol": protocol, "k": k, "draws": draws, "device": device}
     if curve is not None:
+        if fast:
+            raise UsageError("--fast: is of one report; with --curve give --set train.sample_steps=3")
         asked = judging | {"minutes": minutes, "steps": steps, "workers": _count(workers)}
         _evaluate_curve(curve, run, data, out, overrides, method, as_json, asked)
         return
@@ -460,7 +466,7 @@ def evaluate(
         out = out or run.parent / f"{method}-{run.name}"
     elif data is None:
         data = last("dataset", None)
-    changes = _train_keys(overrides)
+    changes = (FAST if fast else {}) | _train_keys(overrides)
     report = evaluate_run(run, data, method=method, changes=changes, workers=_count(workers), out=out, **judging)
     if run is not None:
         remember(run=run)

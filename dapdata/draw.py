@@ -1,4 +1,4 @@
-"""Pictures of point clouds and solids in plain numpy: no GPU, no window, no plotting library.
+"""Pictures of point clouds and solids in plain numpy (and of meshes, whose rays Open3D casts): no GPU, no window.
 
 Points become small discs that lie in their tangent plane, solids are met by one ray a pixel, and both
 share one depth buffer. Everything is drawn at twice the wanted size and averaged down; a shade by depth
@@ -18,11 +18,15 @@ Source: C. Boucheny, "Interactive scientific visualization of large datasets" (2
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from dapdata import meshes
+from dapdata.records import Mesh
 
 Array = NDArray[Any]
 
@@ -33,7 +37,7 @@ POINT_RADIUS = 0.0072  # m: a little less than the pitch of the fused clouds, so
 DEPTH_SHADE = 25.0  # strength of the shade by depth differences, per relative depth step
 LIGHT = np.array([-0.45, -0.65, -0.61])  # camera frame, unit, toward the light: over the viewer's left shoulder
 BACKGROUND = (1.0, 1.0, 1.0)
-BOX, CYLINDER, ELLIPSOID, MESH = range(4)  # as records.PART_KINDS
+FACES = 1 << 20  # more than a part has
 
 
 @dataclass(frozen=True)
@@ -102,7 +106,7 @@ def blank(camera: Camera) -> Canvas:
 def draw_cloud(
     canvas: Canvas,
     points: Array,
-    colors: Array,
+    colors: ArrayLike,
     normals: Array | None = None,
     radius: float = POINT_RADIUS,
     light: float = 0.35,
@@ -208,8 +212,9 @@ def draw_solids(
     opacity: float = 1.0,
     hidden: float = 0.0,
     edge: float = 0.55,
+    triangles: Sequence[Mesh | None] = (),
 ) -> None:
-    """Adds boxes, cylinders and ellipsoids to a canvas; meshes are left out.
+    """Adds boxes, cylinders, ellipsoids and meshes to a canvas.
 
     The solids of one call hide each other; against what is on the canvas already they are blended.
 
@@ -222,20 +227,22 @@ def draw_solids(
         opacity: Of faces in front of what is there; at 1 they hide it.
         hidden: Opacity of faces behind what is there: above 0 they shine through.
         edge: Opacity, on top of that, of the lines where faces meet and where a solid ends.
+        triangles: P, those of the parts that are meshes; may be left out where there are none.
     """
     colors = np.broadcast_to(np.asarray(colors, float), (len(kind), 3))
     depth = np.full_like(canvas.depth, np.inf)
-    face = np.full(canvas.depth.shape, -1, np.int32)
+    face = np.full(canvas.depth.shape, -1)
     color = np.zeros_like(canvas.color)
     light = to_light(canvas.camera)
-    for part in np.flatnonzero(kind != MESH):
-        hit = cast(canvas.camera, int(kind[part]), np.asarray(size[part], float), T_world_part[part])
+    for part in range(len(kind)):
+        mesh = triangles[part] if len(triangles) else None
+        hit = cast(canvas.camera, int(kind[part]), np.asarray(size[part], float), T_world_part[part], mesh)
         if hit is None:
             continue
         window, z, side, normal = hit
         near = z < depth[window]
         depth[window][near] = z[near]
-        face[window][near] = part * 8 + side[near]
+        face[window][near] = part * FACES + side[near]
         bright = 0.74 + 0.30 * (normal[near] @ (T_world_part[part, :3, :3].T @ light))
         color[window][near] = np.clip(colors[part] * bright[:, None], 0, 1)
     _blend(canvas, color, depth, _outline(face), opacity, hidden, edge)
@@ -264,8 +271,10 @@ def _blend(canvas: Canvas, color: Array, depth: Array, line: Array, opacity: flo
     canvas.depth[solid] = depth[solid]
 
 
-def cast(camera: Camera, kind: int, size: Array, T_world_part: Array) -> tuple[Any, Array, Array, Array] | None:
-    """Where the camera's rays first meet one solid.
+def cast(
+    camera: Camera, kind: int, size: Array, T_world_part: Array, mesh: Mesh | None = None
+) -> tuple[Any, Array, Array, Array] | None:
+    """Where the camera's rays first meet one part.
 
     Returns:
         The window of the picture that can see it (a pair of slices), and in that window depth (m, inf for a
@@ -285,7 +294,10 @@ def cast(camera: Camera, kind: int, size: Array, T_world_part: Array) -> tuple[A
     origin = (T[:3, 3] - T_world_part[:3, 3]) @ T_world_part[:3, :3]
     ray = rays(camera, left, right, top, bottom) @ R
     with np.errstate(divide="ignore", invalid="ignore"):
-        z, side, normal = (_meet_box, _meet_cylinder, _meet_ellipsoid)[kind](origin, ray, size / 2)
+        if mesh is None:
+            z, side, normal = (_meet_box, _meet_cylinder, _meet_ellipsoid)[kind](origin, ray, size / 2)
+        else:
+            z, side, normal = _meet_mesh(origin, ray, mesh)
     return (slice(top, bottom), slice(left, right)), z, side, normal
 
 
@@ -331,6 +343,13 @@ def _meet_ellipsoid(origin: Array, ray: Array, half: Array) -> tuple[Array, Arra
     z = np.where(z > 0, z, np.inf)
     normal = (o + np.where(np.isfinite(z), z, 0)[..., None] * d) / half
     return z, np.zeros(z.shape, int), normal / np.linalg.norm(normal, axis=-1, keepdims=True)
+
+
+def _meet_mesh(origin: Array, ray: Array, mesh: Mesh) -> tuple[Array, Array, Array]:
+    z, _, face = meshes.first_hits([mesh], origin, ray)
+    normal = meshes.normals(mesh)[face]
+    away = np.einsum("hwk,hwk->hw", normal, ray) > 0
+    return z, meshes.smooth_groups(mesh)[face], np.where(away[..., None], -normal, normal)
 
 
 def image(canvas: Canvas) -> Array:

@@ -39,7 +39,7 @@ from dapdata.matching import (
 )
 from dapdata.poses import symmetric_distance
 from dapdata.predictions import Predictions, collect, read
-from dapdata.records import SYMMETRIES, Demo, Placement, Verdict, read_record
+from dapdata.records import SYMMETRIES, Demo, Placement, Verdict, read_demo
 from dapdata.report import (
     Affordance,
     Cost,
@@ -202,7 +202,7 @@ def judge_all(
         workers: Processes.
         progress: Called once a scene.
     """
-    demos = [read_record(Demo, dict(sample)) for sample in samples]
+    demos = [read_demo(sample) for sample in samples]
     jobs = [(demo, predictions.of(int(demo.demo)), predictions.ranks(int(demo.demo)), k, placement, protocol) for demo in demos]
     results = []
     for result in _run(jobs, workers):

@@ -16,7 +16,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dapdata import errors, records
-from dapdata.draw import POINT_RADIUS, Camera, Canvas, blank, draw_ground, draw_solids, frame, image, lit, paint, splat
+from dapdata.draw import (
+    POINT_RADIUS,
+    Camera,
+    Canvas,
+    blank,
+    draw_cloud,
+    draw_ground,
+    draw_solids,
+    frame,
+    image,
+    lit,
+    paint,
+    splat,
+)
+from dapdata.poses import inverse, rotate, transform
 
 Array = NDArray[Any]
 Sample = Mapping[str, Array]
@@ -26,6 +40,7 @@ INSET = 150  # px, of the two small pictures of the object
 GUTTER, ROW_TITLE, HEADER, FOOTER = 14, 40, 74, 118  # px
 BAR = PANEL[0] - 180  # px, length of a bar of colours
 DPI = 100
+OBJECT_RADIUS = 0.6 * POINT_RADIUS  # m: the object's cloud is finer than the container's
 SIDE, ABOVE = 0.42, 0.36  # the viewer stands this far aside and above, per unit in front of the opening
 WOOD, CLUTTER = (0.93, 0.90, 0.85), (0.70, 0.73, 0.79)
 VALID, DEMONSTRATED = (0.00, 0.62, 0.45), (0.96, 0.64, 0.00)
@@ -61,22 +76,38 @@ def front_view(sample: Sample, width: int, height: int) -> Camera:
 
 
 def draw_scene(canvas: Canvas, sample: Sample) -> None:
-    """Adds the true parts of the container and of the clutter, and the table."""
+    """Adds the true parts of the container and of the clutter, and the table; the container's cloud if nobody knows them."""
     color = np.where(sample["scene/role"][:, None] == records.ROLES.index("container"), [WOOD], [CLUTTER])
     T_world_part = sample["pose/T_world_container"] @ sample["scene/T_container_part"]
-    draw_solids(canvas, sample["scene/kind"], sample["scene/size"], T_world_part, color)
+    triangles = records.meshes_in(sample)[0]
+    draw_solids(canvas, sample["scene/kind"], sample["scene/size"], T_world_part, color, triangles=triangles)
+    if not len(triangles):
+        draw_cloud(canvas, sample["container/points"].astype(float), WOOD, sample["container/normals"].astype(float))
     draw_ground(canvas, sample["pose/T_world_container"][:3, 3], radius=0.6)
 
 
 def draw_goals(
     canvas: Canvas, sample: Sample, T_world_object: Array, color: tuple[float, float, float], opacity: float, hidden: float
 ) -> None:
-    """Adds the object's solids at (G, 4, 4) poses; `opacity` and `hidden` as in `draw_solids`."""
+    """Adds the object's parts at (G, 4, 4) poses; `opacity` and `hidden` as in `draw_solids`.
+
+    Where nobody knows its parts, its cloud as observed before placing stands for them.
+    """
     if not len(T_world_object):
+        return
+    if not len(sample["object_parts/kind"]):
+        T_object_world = inverse(sample["pose/T_world_object_start"])
+        for T in T_world_object @ T_object_world:
+            points, normals = (
+                transform(T, sample["object/points"].astype(float)),
+                rotate(T, sample["object/normals"].astype(float)),
+            )
+            draw_cloud(canvas, points, color, normals, OBJECT_RADIUS)
         return
     T_world_part = (T_world_object[:, None] @ sample["object_parts/T_object_part"][None]).reshape(-1, 4, 4)
     kind, size = (np.concatenate([sample[f"object_parts/{name}"]] * len(T_world_object)) for name in ("kind", "size"))
-    draw_solids(canvas, kind, size, T_world_part, color, opacity, hidden)
+    triangles = records.meshes_in(sample)[1] * len(T_world_object)
+    draw_solids(canvas, kind, size, T_world_part, color, opacity, hidden, triangles=triangles)
 
 
 def is_demonstrated(sample: Sample) -> Array:
@@ -157,7 +188,7 @@ def goal_picture(sample: Sample, camera: Camera) -> Array:
 def _object_pictures(sample: Sample, side: int) -> dict[str, Array]:
     """The object's cloud at its start pose, by height within it and by superpoint."""
     points, normals = sample["object/points"].astype(float), sample["object/normals"].astype(float)
-    radius = 0.6 * POINT_RADIUS  # the object's cloud is finer than the container's
+    radius = OBJECT_RADIUS
     camera = frame(np.r_[points - radius, points + radius], (1, -0.6, 1.0), side, side)  # from above: below is not seen
     seen = splat(blank(camera).camera, points, normals, radius)
     low, span = points[:, 2].min(), max(float(np.ptp(points[:, 2])), 1e-6)

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dapdata import records
+from dapdata import meshes, records
 from dapdata.draw import to_light
 from dapdata.manifest import Manifest
 from dapdata.pictures import (
@@ -105,6 +105,7 @@ def _demo_data(shown: Shown) -> dict[str, Any]:
     out = sample["pose/T_world_container"][:3, :3] @ sample["scene/opening"]
     name, counts = title(shown)
     T_world_container = sample["pose/T_world_container"]
+    of_container, of_object = records.meshes_in(sample)
     return {
         "name": name,
         "counts": counts,
@@ -116,8 +117,10 @@ def _demo_data(shown: Shown) -> dict[str, Any]:
         "container": _cloud_data(sample, "container"),
         "object": _cloud_data(sample, "object"),
         "T_world_container": T_world_container.ravel().tolist(),
-        "parts": _parts(sample["scene/kind"], sample["scene/size"], sample["scene/T_container_part"]),
-        "object_parts": _parts(sample["object_parts/kind"], sample["object_parts/size"], sample["object_parts/T_object_part"]),
+        "parts": _parts(sample["scene/kind"], sample["scene/size"], sample["scene/T_container_part"], of_container),
+        "object_parts": _parts(
+            sample["object_parts/kind"], sample["object_parts/size"], sample["object_parts/T_object_part"], of_object
+        ),
         "goals": [
             {"T": T.ravel().tolist(), "demonstrated": bool(d)}
             for T, d in zip(sample["goals/T_world_object"], is_demonstrated(sample))
@@ -129,8 +132,15 @@ def _demo_data(shown: Shown) -> dict[str, Any]:
     }
 
 
-def _parts(kind: Array, size: Array, T: Array) -> list[dict[str, Any]]:
-    return [{"kind": int(k), "size": s.tolist(), "T": t.ravel().tolist()} for k, s, t in zip(kind, size, T)]
+def _parts(kind: Array, size: Array, T: Array, found: Sequence[records.Mesh | None]) -> list[dict[str, Any]]:
+    """The parts; with a mesh its sharp edges, in tenths of a millimetre."""
+    parts: list[dict[str, Any]] = [
+        {"kind": int(k), "size": s.tolist(), "T": t.ravel().tolist()} for k, s, t in zip(kind, size, T)
+    ]
+    for part, mesh in zip(parts, found):
+        if mesh is not None:
+            part["edges"] = np.round(meshes.sharp_edges(mesh) * 1e4).astype(int).reshape(-1, 6).tolist()
+    return parts
 
 
 def _cloud_data(sample: Mapping[str, Array], body: str) -> dict[str, Any]:

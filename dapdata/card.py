@@ -25,6 +25,7 @@ configs:
 ---
 """
 LICENSE = "cc0-1.0"  # synthetic geometry, nobody's work: the data may be used for anything
+IMPORTED = "other"  # what others made is theirs
 SIZES = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"), (1_000_000, "100K<n<1M"))
 
 LOADER = """```python
@@ -50,7 +51,8 @@ def render(manifest: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], previ
     """
     size = next((text for limit, text in SIZES if len(rows) < limit), "n>1M")
     parts = [
-        HEADER.format(license=LICENSE, name=manifest["name"], size=size) + f"# {manifest['name']}\n",
+        HEADER.format(license=IMPORTED if _source(manifest) else LICENSE, name=manifest["name"], size=size)
+        + f"# {manifest['name']}\n",
         _what(manifest, rows),
         "\n".join(f"![{path}]({path})" for path in previews),
         _splits(manifest),
@@ -62,8 +64,16 @@ def render(manifest: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], previ
     return "\n".join(part for part in parts if part)
 
 
+def _source(manifest: Mapping[str, Any]) -> str | None:
+    """Where the demos were imported from; None if they were drawn."""
+    source: str | None = manifest["recipe"]["scene"].get("source")
+    return source
+
+
 def _what(manifest: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> str:
-    asked = f"Demonstrations of placing an object into a container, task `{manifest['task']}`, made in simulation by dapdata"
+    source = _source(manifest)
+    by = f"imported by dapdata from `{source}`, where others made them" if source else "made in simulation by dapdata"
+    asked = f"Demonstrations of placing an object into a container, task `{manifest['task']}`, {by}"
     if not rows:
         return f"{asked}: {manifest['demos']} demos, not yet labelled.\n"
     names = ("goals", "container_points", "object_points", "superpoints", "positives", "correspondences")
@@ -135,7 +145,7 @@ def _how(manifest: Mapping[str, Any]) -> str:
         f"Seed {recipe['seed']}. The whole recipe, every default filled in, is in `manifest.json`; with it and the versions "
         f"above the same bytes come out again. Content digest: `{manifest['content_sha256']}`.",
         "",
-        f"Licence: {LICENSE}.",
+        "Licence and citation: those of the demos' makers." if _source(manifest) else f"Licence: {LICENSE}.",
         "",
     ]
     return "\n".join(lines)

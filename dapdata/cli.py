@@ -504,6 +504,78 @@ def run(
     show({**made, "result": report}, as_json, made_text(report, made))
 
 
+# Other formats ---------------------------------------------------------------------------------------------
+
+imports = typer.Typer(no_args_is_help=True, rich_markup_mode=None, epilog="Example: dapdata import rpdiff DEMOS --meshes DIR")
+app.add_typer(imports, name="import", help="Make a dataset of demos in the format of other tools.")
+exports = typer.Typer(no_args_is_help=True, rich_markup_mode=None, epilog="Example: dapdata export rpdiff DATASET --out DIR")
+app.add_typer(exports, name="export", help="Write a dataset in the format of other tools.")
+
+Target = Annotated[Path, _option("--out", help="Folder to write; must be new or empty", metavar="DIR")]
+
+
+@imports.command("rpdiff", epilog="Example: dapdata import rpdiff book_chunked --meshes descriptions/objects --out data/books")
+def import_rpdiff(
+    source: Annotated[Path, typer.Argument(help="demo_aug_*.npz, single or in chunks: a file, or a folder with all below it.")],
+    out: Out = None,
+    meshes: Annotated[
+        Path | None,
+        _option(
+            "--meshes", help="Folder with the meshes and slot files", default="none: goals stay as commanded", metavar="DIR"
+        ),
+    ] = None,
+    demos: Demos = None,
+    workers: Workers = None,
+    engine: Engine = "local",
+    overrides: Overrides = None,
+    dry_run: DryRun = False,
+    fresh: Fresh = False,
+    as_json: Json = False,
+) -> None:
+    """Demos of RPDiff, or in its layout (AnyPlace). Goals are settled and checked again. Goes on where it stopped."""
+    from dapdata import manifest
+    from dapdata.imports import rpdiff_recipe, run
+
+    asked = rpdiff_recipe(source, meshes, demos, overrides or ())
+    with progress("import", "demo") as advance:
+        made = run(
+            asked,
+            out,
+            workers=_count(workers),
+            engine=engine,
+            fresh=fresh,
+            dry_run=dry_run,
+            progress=None if dry_run else advance,
+        )
+    if isinstance(made, Path):
+        rejected = manifest.read(made).rejects.demos
+        told = "".join(f", {count} {reason}" for reason, count in rejected.items())
+        say(f"imported {asked.demos - sum(rejected.values())} of {asked.demos} demos{told}; next: dapdata label {made}")
+    _show_made(made, as_json)
+
+
+@exports.command("rpdiff", epilog="Example: dapdata export rpdiff data/can_cabinet --out rpdiff/can_cabinet_chunked")
+def export_rpdiff(
+    out: Target,
+    dataset: LastDataset = None,
+    shard_size: Annotated[int, typer.Option("--shard-size", help="Demos in a file.", min=1, metavar="N")] = 9,
+    as_json: Json = False,
+) -> None:
+    """Chunks that RPDiff's own loader reads. With split lists and meshes."""
+    _export("rpdiff", dataset, out, as_json, shard_size=shard_size)
+
+
+def _export(kind: str, dataset: Path | None, out: Path, as_json: bool, **options: Any) -> None:
+    """Runs one export; options that were not given are the format's own."""
+    from importlib import import_module
+
+    folder, write = last("dataset", dataset), import_module(f"dapdata.interop.{kind}").export
+    given = {name: value for name, value in options.items() if value is not None}
+    with progress(f"export {kind}", "demo") as advance:
+        made = write(folder, out, **given, progress=advance)
+    show({"out": str(made), "format": kind, "dataset": str(folder), **options}, as_json, str(made))
+
+
 # Around ----------------------------------------------------------------------------------------------------
 
 

@@ -87,7 +87,7 @@ def generate(
     fresh: bool = False,
     dry_run: bool = False,
     progress: Progress | None = None,
-    table: str = __name__,
+    table: str | None = None,
 ) -> Path | Plan:
     """Makes scenes, settled demonstrations and point clouds; goes on where an earlier call stopped.
 
@@ -99,12 +99,13 @@ def generate(
         fresh: Whether to delete what is there first.
         dry_run: Whether only to say what would run, and why.
         progress: Called with demos done and demos in all whenever a unit is done.
-        table: Module with STAGES and parse; tests put toys here.
+        table: Module with STAGES and parse; default: the one for such scenes. Tests put toys here.
 
     Returns:
         The dataset's folder, or the Plan.
     """
     given = recipe_or_path if not isinstance(recipe_or_path, (str, Path)) else recipe.load(recipe_or_path)
+    table = table or given.scene.stages
     root, stages = Path(out) if out else Path("data") / given.name, import_module(table).STAGES
     resolved = recipe.resolve(given)
     command = _Command(root, table, stages, GENERATE, given, resolved, specs(stages, resolved))
@@ -119,7 +120,7 @@ def label(
     engine: str = "local",
     dry_run: bool = False,
     progress: Progress | None = None,
-    table: str = __name__,
+    table: str | None = None,
 ) -> Path | Plan:
     """Makes superpoints, affordance and correspondence of a generated dataset, and its shards. Never simulates.
 
@@ -131,9 +132,11 @@ def label(
     Raises:
         UsageError: for an override of what earlier stages read.
     """
-    root, stages = Path(dataset), import_module(table).STAGES
+    root = Path(dataset)
     found = manifest.read(root)
-    given = import_module(table).parse(found.recipe, overrides, str(root / manifest.MANIFEST))
+    given = recipe.from_resolved(found.recipe, overrides, str(root / manifest.MANIFEST))
+    table = table or given.scene.stages
+    stages = import_module(table).STAGES
     resolved = recipe.resolve(given)
     made = {name: entry.spec for name, entry in found.stages.items() if name in GENERATE and entry.units}
     if made.keys() != set(GENERATE):
@@ -216,7 +219,7 @@ class _Command:
             reasons = ", ".join(f"{reason} {count}" for reason, count in now.rejects.demos.items())
             raise UsageError(
                 f"{self.root}: all {now.demos} demos were rejected ({reasons}), expected some that are not; "
-                "change cameras, noise or superpoints in the recipe"
+                f"{self.recipe.scene.remedy}"
             )
         return self.root
 

@@ -52,7 +52,7 @@ up and z = 0 on the table top. The container frame has z up and its origin at th
 underside. The object frame has its origin at the centre of the object's bounding box, and z up at a goal. Cameras
 have OpenCV axes: x right, y down, z ahead. There are no quaternions.
 
-A part that is a mesh has its triangles in `mesh_vertices/` and `mesh_faces/`; datasets without such parts, which are all
+A part that is a mesh has its triangles in `mesh_vertices/` and `mesh_faces/`; datasets without them, which are all
 that were not imported, have no such groups.
 
 `schemas/shard.schema.json` says the same for machines: it describes {{path of each array: its zarr.json}}.

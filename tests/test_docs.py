@@ -101,7 +101,10 @@ def test_every_command_and_option_that_a_page_names_exists(page: Path) -> None:
     known = typer.main.get_command(cli.app).commands  # type: ignore[attr-defined]
     for line in commands(page.read_text(encoding="utf-8")):
         name, *words = shlex.split(line)
-        options = {option for parameter in known[name].params for option in parameter.opts}
+        command = known[name]
+        while words and words[0] in getattr(command, "commands", {}):  # a group, such as `import`
+            command = command.commands[words.pop(0)]
+        options = {option for parameter in command.params for option in parameter.opts}
         assert {word for word in words if re.fullmatch(r"-{1,2}[a-z][a-z-]*", word)} <= options | {"--help"}, line
 
 

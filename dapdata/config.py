@@ -123,7 +123,7 @@ PAPER: dict[str, Any] = {
 AT_INFERENCE = ("sample_steps", "crop_margin", "cap_crop", "refine", "hover", "ranking")
 
 # STEPS and CRITERIA of daptrain.refine, which must not be imported here; a test compares them.
-Step = Literal["gravity", "yaw", "settle", "search"]
+Step = Literal["gravity", "yaw", "settle", "search", "spread"]
 Criterion = Literal["inside", "path", "support", "balance", "residual"]
 
 

@@ -4,6 +4,9 @@ Everything that is published goes through here, in this order: write in `staging
 folders from the leaves up, rename, fsync the folder that holds the new name. A reader or a crash therefore sees
 a committed folder whole or not at all. zarr writes its chunks by rename too, but never fsyncs, and reads a
 missing chunk as fill values without a word; hence a whole unit is committed at once and named by its hashes.
+
+A dataset may come from anywhere. Links in it could lead a reader or a writer out of its folder, so there are none:
+`is_inside` and `refuse_links` see to that, and `read_json` believes no size before it has looked.
 """
 
 from __future__ import annotations
@@ -14,6 +17,7 @@ import json
 import os
 import shutil
 import socket
+import stat
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
@@ -22,10 +26,12 @@ from hashlib import file_digest, sha256
 from pathlib import Path
 from typing import Any
 
-from dapdata.errors import EnvironmentProblem, LockedError
+from dapdata.errors import EnvironmentProblem, FormatError, LockedError
 
 STAGING = "staging"
 TEMPORARY = ".*.tmp"  # names that are half-written until they are renamed
+LOCK = ".lock"
+MAX_JSON = 256_000_000  # bytes: the manifest of ten million demos
 FULL_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 NO_PERMISSION = (errno.EACCES, errno.EPERM, errno.EROFS)
 
@@ -109,10 +115,21 @@ def replace_file(path: Path, data: bytes) -> None:
     """Writes a file so that its name holds either the old bytes or the new ones, also after a power cut."""
     make_folder(path.parent)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    temporary.write_bytes(data)
-    _fsync(temporary)
+    try:
+        temporary.write_bytes(data)
+        _fsync(temporary)
+    except OSError:  # a full disk: what was written of it must not fill it further
+        temporary.unlink(missing_ok=True)
+        raise
     _rename(temporary, path)
     _fsync(path.parent)
+
+
+def is_occupied(folder: Path) -> bool:
+    """Whether something is there, other than what a killed command of ours may have left in an empty folder."""
+    if not folder.is_dir():
+        return folder.exists()
+    return any(path.name not in (LOCK, STAGING) and not path.match(TEMPORARY) for path in folder.iterdir())
 
 
 def remove_file(path: Path) -> None:
@@ -133,27 +150,35 @@ def discard(root: Path, path: Path) -> None:
 
 
 def sweep(root: Path) -> None:
-    """Removes what killed processes left in staging and half-written names; only under the lock."""
-    shutil.rmtree(root / STAGING, ignore_errors=True)
+    """Removes what killed processes left in staging and half-written names; only under the lock.
+
+    Staging is renamed before it is deleted: a worker that outlived its command must not commit what is half gone.
+    """
+    grave = root / f".{STAGING}.tmp"
+    shutil.rmtree(grave, ignore_errors=True)
+    if (root / STAGING).is_dir():
+        _rename(root / STAGING, grave)
+    shutil.rmtree(grave, ignore_errors=True)
     for leftover in [*root.glob(TEMPORARY), *root.glob(f"*/{TEMPORARY}")]:
         leftover.unlink()
 
 
 @contextmanager
 def lock(root: Path) -> Iterator[None]:
-    """Holds the dataset for one writer; readers need no lock. The lock dies with its process.
+    """Holds the dataset or run for one writer; readers need no lock. The lock dies with its process.
 
     Raises:
         LockedError: at once, if another process holds it; the message says which.
+        FormatError: if the folder has links, through which a writer would change what is elsewhere.
     """
     make_folder(root)
-    with (root / ".lock").open("a+") as file:
+    refuse_links(root)
+    with os.fdopen(os.open(root / LOCK, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o644), "r+") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
-            file.seek(0)
-            holder = file.read().strip() or "another process"
-            raise LockedError(f"{root}: in use by {holder}; wait for it to end, or stop it, and run again") from error
+            who = holder(root) or "another process"
+            raise LockedError(f"{root}: in use by {who}; wait for it to end, or stop it, and run again") from error
         file.truncate(0)
         file.write(f"process {os.getpid()} on {socket.gethostname()} ({' '.join(sys.argv)[:200]})")
         file.flush()
@@ -168,10 +193,49 @@ def lock(root: Path) -> Iterator[None]:
 def holder(root: Path) -> str | None:
     """Who works on the dataset now, as it said itself; None if nobody does."""
     try:
-        words = (root / ".lock").read_text()
-    except OSError:
+        words = (root / LOCK).read_text(errors="replace")[:400]
+        return words if Path("/proc", words.split()[1]).exists() else None
+    except (OSError, ValueError, IndexError):
         return None
-    return words if words and Path("/proc", words.split()[1]).exists() else None
+
+
+# What others may have put there ------------------------------------------------------------------------------
+
+
+def is_inside(root: Path, path: Path) -> bool:
+    """Whether a path leads, through all links, to something in the folder `root`."""
+    return path.resolve().is_relative_to(root.resolve())
+
+
+def refuse_links(root: Path) -> None:
+    """Raises a FormatError if the folder, or a folder in it, has symbolic links: two levels, down to the units."""
+    for path in [*root.glob("*"), *root.glob("*/*")]:
+        if path.is_symlink():
+            raise FormatError(
+                f"{path}: a link, expected files and folders of a dataset or run alone; put what it leads to there"
+            )
+
+
+def read_json(path: Path, limit: int = MAX_JSON) -> Any:
+    """What a JSON file holds.
+
+    Raises:
+        ValueError: not JSON, nested without end, larger than `limit`, or no file of bytes at all.
+        OSError: if it cannot be read.
+    """
+    about = path.lstat()
+    if not stat.S_ISREG(about.st_mode):
+        raise ValueError("no plain file, expected JSON")
+    if about.st_size > limit:
+        raise ValueError(f"{about.st_size} bytes, expected at most {limit}")
+    try:
+        return json.loads(path.read_bytes(), parse_constant=_refuse_constant)
+    except RecursionError as error:
+        raise ValueError("nested too deeply") from error
+
+
+def _refuse_constant(name: str) -> Any:
+    raise ValueError(f"{name}, expected numbers that are finite")
 
 
 @contextmanager
@@ -194,7 +258,7 @@ def disk_problems(root: Path, needed: int = 0) -> Iterator[None]:
             ) from error
         if error.errno in NO_PERMISSION:
             raise EnvironmentProblem(
-                f"{error.filename or root}: {error.strerror}, expected a folder that can be written; choose another with --out"
+                f"{error.filename or root}: {error.strerror}, expected a folder that can be written; choose another"
             ) from error
         raise
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dapdata import manifest, rng, store
+from dapdata import durable, manifest, rng, store
 from dapdata.errors import CorruptionError, FormatError, UsageError, hint, nearest, require
 from dapdata.manifest import Manifest
 from dapdata.records import Array
@@ -38,20 +38,29 @@ def open(root: str | Path, split: str | None = None) -> Dataset:
     Raises:
         FormatError: if there is no dataset, one of another format, or one that isn't labelled yet.
         UsageError: if there is no such split.
-        CorruptionError: if the manifest and the index don't agree.
+        CorruptionError: if the manifest or the index is not what was written.
     """
     folder = locate(root)
-    found = manifest.read(folder)
-    if not found.shards:
-        raise FormatError(f"{folder}: generated but not labelled, expected shards; run `dapdata label {folder}`")
+    found, index = _read(folder)
     known = list(found.splits)
     if split is not None and split not in known:
         raise UsageError(f"split: got '{split}', expected one of {', '.join(SPLITS)}{hint(split, list(SPLITS))}")
-    index = manifest.read_index(folder)
-    if len(index["demo"]) != sum(shard.demos for shard in found.shards):
-        raise CorruptionError(f"{folder}: index.parquet and manifest.json name different demos; run `dapdata verify {folder}`")
     chosen = np.arange(len(index["demo"])) if split is None else np.flatnonzero(index["split"] == split)
     return Dataset(folder, split, found, {name: column[chosen] for name, column in index.items()})
+
+
+def _read(folder: Path) -> tuple[Manifest, dict[str, Array]]:
+    """Manifest and index that belong together, also while a command puts others in their place."""
+    found = manifest.read(folder)
+    while True:
+        if not found.shards:
+            raise FormatError(f"{folder}: generated but not labelled, expected shards; run `dapdata label {folder}`")
+        try:
+            return found, manifest.read_index(folder, found)
+        except CorruptionError:
+            before, found = found, manifest.read(folder)
+            if found == before:
+                raise
 
 
 def locate(root: str | Path) -> Path:
@@ -109,7 +118,7 @@ class Dataset:
             CorruptionError: if it isn't what was written.
         """
         folder = self.root / shard
-        if not store.is_committed(folder):
+        if not store.is_committed(folder) or not durable.is_inside(self.root, folder):
             raise CorruptionError(
                 f"{folder}: missing, expected a shard that the manifest names; run `dapdata verify {self.root}`"
             )

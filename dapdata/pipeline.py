@@ -23,6 +23,7 @@ from typing import Any
 from dapdata import durable, engines, manifest, recipe, tasks, units
 from dapdata.engines import Failure, Job
 from dapdata.errors import EnvironmentProblem, FormatError, QuarantineError, UsageError, require
+from dapdata.manifest import Progress
 from dapdata.plan import Before, Cost, Plan, before, make_plan, measured_cost, missing
 from dapdata.recipe import Recipe
 from dapdata.records import Cloud, Demo, Labels, Rejected, Superpoints
@@ -75,7 +76,7 @@ parse = recipe.from_resolved  # what a worker makes its recipe with
 
 # The commands ----------------------------------------------------------------------------------------------
 
-Progress = Callable[[int, int], None]  # demos done, demos in all
+OnProgress = Callable[[int, int], None]  # demos done, demos in all
 
 
 def generate(
@@ -86,7 +87,7 @@ def generate(
     engine: str = "local",
     fresh: bool = False,
     dry_run: bool = False,
-    progress: Progress | None = None,
+    progress: OnProgress | None = None,
     table: str = __name__,
 ) -> Path | Plan:
     """Makes scenes, settled demonstrations and point clouds; goes on where an earlier call stopped.
@@ -118,7 +119,7 @@ def label(
     workers: int = 1,
     engine: str = "local",
     dry_run: bool = False,
-    progress: Progress | None = None,
+    progress: OnProgress | None = None,
     table: str = __name__,
 ) -> Path | Plan:
     """Makes superpoints, affordance and correspondence of a generated dataset, and its shards. Never simulates.
@@ -132,12 +133,10 @@ def label(
         UsageError: for an override of what earlier stages read.
     """
     root, stages = Path(dataset), import_module(table).STAGES
-    found = manifest.read(root)
+    found = _generated(root)
     given = import_module(table).parse(found.recipe, overrides, str(root / manifest.MANIFEST))
     resolved = recipe.resolve(given)
-    made = {name: entry.spec for name, entry in found.stages.items() if name in GENERATE and entry.units}
-    if made.keys() != set(GENERATE):
-        raise FormatError(f"{root}: stages {sorted(made)}, expected {', '.join(GENERATE)}; run `dapdata generate` first")
+    made = {name: found.specs[name] for name in GENERATE}
     _refuse_upstream(found.recipe, resolved, made)
     command = _Command(root, table, stages, LABEL, given, resolved, specs(stages, resolved) | made)
     return command.plan(False) if dry_run else command.run(workers, engine, False, progress)
@@ -147,14 +146,38 @@ def attach(dataset: str | Path, pictures: Mapping[str, bytes]) -> None:
     """Adds pictures, by their path such as "preview/goals.png", to a labelled dataset, its manifest and its card."""
     root = Path(dataset)
     with durable.disk_problems(root), durable.lock(root):
+        found = manifest.read(root)
+        specs = {name: entry.spec for name, entry in found.stages.items()}
+        shard_stage = next(stage.name for stage in STAGES if stage.is_shard)
+        _note(root, Progress(recipe=found.recipe, specs=specs, stages=list(LABEL), shard_stage=shard_stage))
         units.attach(root, pictures)
+
+
+def _generated(root: Path) -> Before:
+    """What a generated dataset was made for: from its manifest, or from what an interrupted `label` left of that."""
+    try:
+        found = manifest.read(root)
+        made = Before(found.recipe, {name: entry.spec for name, entry in found.stages.items() if entry.units})
+    except FormatError:
+        left = manifest.read_progress(root)
+        if (root / manifest.MANIFEST).exists() or left is None or left.stages != list(LABEL):
+            raise
+        made = Before(left.recipe, left.specs)
+    if not made.specs.keys() >= {*GENERATE}:
+        raise FormatError(f"{root}: stages {sorted(made.specs)}, expected {', '.join(GENERATE)}; run `dapdata generate` first")
+    return made
+
+
+def _note(root: Path, progress: Progress) -> None:
+    """Writes down what a command works on, for whoever goes on after a crash."""
+    durable.replace_file(root / manifest.PROGRESS, json.dumps(progress.model_dump(mode="json")).encode())
 
 
 def _refuse_upstream(old: Mapping[str, Any], new: Mapping[str, Any], made: Mapping[str, Spec]) -> None:
     """Relabelling doesn't simulate: what earlier stages read cannot be changed here."""
     fixed = ["name", "seed", "demos", "shard_size", *(section for spec in made.values() for section in spec["sections"])]
     for name in fixed:
-        if old[name] != new[name]:
+        if old.get(name) != new.get(name):
             raise UsageError(
                 f"--set {name}: `dapdata label` does not simulate or observe again; change it with `dapdata generate`"
             )
@@ -188,23 +211,20 @@ class _Command:
         cost = measured_cost(self.root, REFERENCE_COST)
         return make_plan(self.layout, mine, self.units, self.resolved, previous, cost, fresh)
 
-    def run(self, workers: int, engine: str, fresh: bool, progress: Progress | None) -> Path:
+    def run(self, workers: int, engine: str, fresh: bool, progress: OnProgress | None) -> Path:
         """Makes the missing units and publishes what is there then."""
-        _check_packages(stage for stage in self.stages if stage.name in self.wanted)
+        check_packages(stage for stage in self.stages if stage.name in self.wanted)
         found, needed = engines.get(engine), int(self.plan(fresh).gigabytes * 1e9)
         _check_space(self.root, needed)
         with durable.disk_problems(self.root, needed), durable.lock(self.root):
             if fresh:
                 _clear(self.root)
             jobs = self._jobs(needed)
+            shard_stage = self.layout.shard_stage
+            _note(
+                self.root, Progress(recipe=self.resolved, specs=self.specs, stages=list(self.wanted), shard_stage=shard_stage)
+            )
             if jobs:
-                left = {
-                    "recipe": self.resolved,
-                    "specs": self.specs,
-                    "stages": self.wanted,
-                    "shard_stage": self.layout.shard_stage,
-                }
-                durable.replace_file(self.root / manifest.PROGRESS, json.dumps(left).encode())  # specs stay in their order
                 shutil.rmtree(self.root / QUARANTINE, ignore_errors=True)
                 try:
                     self._work(found, jobs, workers, progress)
@@ -229,7 +249,7 @@ class _Command:
         place, stages = (unit.index, unit.start, unit.stop), tuple(self.wanted)
         return units.Work(str(self.root), self.table, self.resolved, self.specs, place, stages, needed).to_json()
 
-    def _work(self, engine: engines.Engine, jobs: Mapping[str, Unit], workers: int, progress: Progress | None) -> None:
+    def _work(self, engine: engines.Engine, jobs: Mapping[str, Unit], workers: int, progress: OnProgress | None) -> None:
         """Has the jobs done; those that could not be are kept apart with what is needed to replay them."""
         total = self.resolved["demos"]
         done = total - sum(unit.stop - unit.start for unit in jobs.values())
@@ -244,7 +264,7 @@ class _Command:
 
         if progress:
             progress(done, total)
-        queue = [Job(text, START_TIMEOUT + DEMO_TIMEOUT * (unit.stop - unit.start)) for text, unit in jobs.items()]
+        queue = [Job(text, timeout(unit)) for text, unit in jobs.items()]
         failures = engine.run(units.CALL, queue, workers=workers, on_done=on_done)
         if failures:
             raise QuarantineError(self._quarantine(failures, jobs))
@@ -280,6 +300,11 @@ REFERENCE_COST: dict[str, Cost] = {  # s and bytes a demo at 320x240, until this
 }
 
 
+def timeout(unit: Unit) -> float:
+    """Seconds after which a unit is given up."""
+    return START_TIMEOUT + DEMO_TIMEOUT * (unit.stop - unit.start)
+
+
 def _check_folder(root: Path) -> None:
     """Refuses to write among somebody's other files."""
     ours = (manifest.MANIFEST, manifest.PROGRESS, manifest.INDEX, ".lock", "stages")
@@ -289,7 +314,7 @@ def _check_folder(root: Path) -> None:
         raise FormatError(f"{root}: a folder with other files and no dataset; choose an empty or new one with --out")
 
 
-def _check_packages(stages: Iterable[Stage]) -> None:
+def check_packages(stages: Iterable[Stage]) -> None:
     """Raises a MissingExtraError before anything is written if a stage needs a package that is not installed."""
     for package in (package for stage in stages for package in stage.packages):
         if find_spec(package) is None:

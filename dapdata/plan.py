@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -73,11 +72,8 @@ def before(root: Path) -> Before | None:
     except FormatError:
         if (root / manifest.MANIFEST).is_file():
             raise
-    try:
-        left = json.loads((root / manifest.PROGRESS).read_bytes())
-        return Before(left["recipe"], left["specs"])
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
+    left = manifest.read_progress(root)
+    return Before(left.recipe, left.specs) if left else None
 
 
 def missing(layout: Layout, stage: str, units: Sequence[Unit]) -> list[Unit]:
@@ -87,13 +83,10 @@ def missing(layout: Layout, stage: str, units: Sequence[Unit]) -> list[Unit]:
 
 def measured_cost(root: Path, reference: Mapping[str, Cost]) -> dict[str, Cost]:
     """Seconds and bytes a demo in each stage: as last measured on this dataset, or else the reference."""
-    try:
-        lines = [json.loads(line) for line in (root / manifest.LOG).read_text().splitlines()[-LOG_LINES:]]
-    except (OSError, ValueError):
-        lines = []
+    lines = manifest.read_log(root)[-LOG_LINES:]
     costs = dict(reference)
     for stage in reference:
-        mine = [line for line in lines if line.get("stage") == stage and line["demos"]]
+        mine = [line for line in lines if line["stage"] == stage and line["demos"]]
         if mine:
             demos = sum(line["demos"] for line in mine)
             costs[stage] = (sum(line["cpu_seconds"] for line in mine) / demos, sum(line["bytes"] for line in mine) / demos)

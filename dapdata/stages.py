@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from graphlib import TopologicalSorter
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -79,9 +80,10 @@ def _installed(package: str) -> str:
 
 
 def unit_keys(plan: Mapping[str, Spec], seed: int, unit: Unit) -> dict[str, str]:
-    """The key of a unit in each stage. The stages come in an order in which each follows what it needs."""
+    """The key of a unit in each stage."""
     keys: dict[str, str] = {}
-    for name, spec in plan.items():
+    for name in TopologicalSorter({name: spec["needs"] for name, spec in plan.items()}).static_order():
+        spec = plan[name]
         keys[name] = durable.digest(
             {
                 "format": FORMAT,

@@ -280,10 +280,9 @@ def publish(
         rejects=_rejects(records),
         stages=_stage_entries(layout, entries),
         files={},
-        created_by={"dapdata": _version()} | store.created_by(),
+        created_by=created_by(),
     )
     _write(layout.root, now, rows, _previews(layout.root, now))
-    durable.remove_file(layout.root / manifest.PROGRESS)
     return now
 
 
@@ -292,12 +291,13 @@ def _write(root: Path, now: Manifest, rows: Sequence[Mapping[str, Any]], preview
     index = {manifest.INDEX: manifest.index_bytes(rows)} if rows else {}
     text = card.render(now.model_dump(mode="json"), rows, sorted(previews))
     manifest.publish(root, now, {**index, **previews, manifest.CARD: text.encode()})
+    durable.remove_file(root / manifest.PROGRESS)
 
 
 def attach(root: Path, pictures: Mapping[str, bytes]) -> None:
     """Adds pictures under preview/ to a labelled dataset; the caller holds its lock."""
     now = manifest.read(root)
-    index = manifest.read_index(root)
+    index = manifest.read_index(root, now)
     rows = [{name: column[i].item() for name, column in index.items()} for i in range(len(index["demo"]))]
     _write(root, now, rows, _previews(root, now) | dict(pictures))
 
@@ -317,8 +317,9 @@ def _stage_entries(layout: Layout, entries: Mapping[str, list[UnitEntry]]) -> di
     return found
 
 
-def _version() -> str:
-    return str(import_module("dapdata").__version__)
+def created_by() -> dict[str, str]:
+    """The versions that write datasets here."""
+    return {"dapdata": str(import_module("dapdata").__version__)} | store.created_by()
 
 
 def _entry(layout: Layout, stage: Stage, unit: Unit) -> tuple[UnitEntry, dict[str, Any]]:

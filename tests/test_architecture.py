@@ -19,17 +19,17 @@ DAPTRAIN = sorted((ROOT / "train/daptrain").rglob("*.py"))
 # siblings only in observe, which is one stage.
 LINES = (
     ("errors", "rng", "poses", "config"),
-    ("records", "strict_yaml", "durable", "clouds", "console"),
-    ("solids", "meshes", "keys", "slic", "split", "matching"),
+    ("records", "strict_yaml", "durable", "npz", "console"),
+    ("solids", "meshes", "keys", "slic", "split", "matching", "sense", "clouds"),
     ("tabletop",),
     ("tasks",),
     ("simulate", "observe", "cluster", "labels"),
     ("recipe", "store", "stages", "engines", "manifest", "card", "report", "predictions"),
     ("plan", "units"),
     ("pipeline",),
-    ("loading", "draw", "schemas"),
-    ("metrics", "health", "pictures"),
-    ("viewer",),
+    ("loading", "draw", "schemas", "reproduce"),
+    ("metrics", "audit", "pictures"),
+    ("viewer", "health"),
     ("show", "bench"),
     ("cli",),
     ("__main__",),
@@ -42,7 +42,7 @@ MUST_NOT_KNOW = {
 }
 DAPTRAIN_MAY_KNOW = {
     "loading", "metrics", "records", "poses", "simulate", "errors", "rng", "config", "solids", "report", "predictions",
-    "pictures", "draw", "matching", "clouds",
+    "pictures", "draw", "matching", "clouds", "durable",
     "cluster",  # a user's own cloud must be partitioned as the training clouds were
 }  # fmt: skip
 DOORS = {

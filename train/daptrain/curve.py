@@ -24,7 +24,7 @@ from typing import Any, Literal, cast
 
 from pydantic import ValidationError
 
-from dapdata import loading
+from dapdata import durable, loading
 from dapdata.config import AT_INFERENCE, EvalConfig, TrainConfig
 from dapdata.errors import CheckpointError, FormatError, UsageError
 from dapdata.loading import Dataset
@@ -215,7 +215,7 @@ def begun(out: Path, wanted: Asked) -> Curve:
     """
     path = out / "curve.json"
     if not path.exists():
-        if out.is_file() or (out.is_dir() and any(out.iterdir()) and not (out / "config.json").exists()):
+        if durable.is_occupied(out) and not (out / "config.json").exists():
             raise UsageError(
                 f"{out}: is there and is no curve, expected a new folder, a curve's or a run's; give another one with --out"
             )

@@ -75,13 +75,7 @@ class Audit:
         state = "whole" if self.ok else f"{len(self.problems)} problems"
         again = f", {self.reproduced} units made anew" if self.reproduced else ""
         head = f"{self.root}: {state}; {self.files} files compared with their hashes, {self.demos} demos decoded{again}"
-        lines = [head, *(f"  {line}" for line in self.problems), *(f"  note: {line}" for line in self.notes)]
-        return "\n".join(_printable(line) for line in lines)
-
-
-def _printable(line: str) -> str:
-    """The line without what would steer a terminal: names of files may hold anything."""
-    return "".join(letter if letter.isprintable() else "?" for letter in line)
+        return "\n".join([head, *(f"  {line}" for line in self.problems), *(f"  note: {line}" for line in self.notes)])
 
 
 @dataclass

@@ -26,6 +26,7 @@ from dapdata.console import (
     last,
     made_text,
     placements_text,
+    printable,
     progress,
     remember,
     report_text,
@@ -118,7 +119,7 @@ def run_app(arguments: Sequence[str]) -> int:
 
 
 def _fail(message: str, code: int) -> int:
-    print(message, file=sys.stderr)
+    print(printable(message), file=sys.stderr)
     return code
 
 

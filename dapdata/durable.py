@@ -54,7 +54,9 @@ def digest(value: Any) -> str:
 
 
 def hash_file(path: Path) -> str:
-    """sha256 of a file's bytes."""
+    """sha256 of a file's bytes; an OSError if it is no plain file: a pipe would be waited for."""
+    if not stat.S_ISREG(path.lstat().st_mode):
+        raise OSError(errno.EINVAL, "no plain file", str(path))
     with path.open("rb") as file:
         return file_digest(file, "sha256").hexdigest()
 

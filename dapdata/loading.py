@@ -7,15 +7,17 @@ slice whatever its size, so a slice a demo is far slower than the unit at once. 
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
 from dapdata import durable, manifest, rng, store
+from dapdata.config import Section
 from dapdata.errors import CorruptionError, FormatError, UsageError, hint, nearest, require
 from dapdata.manifest import Manifest
 from dapdata.records import Array
@@ -25,6 +27,7 @@ from dapdata.store import COLUMNS, Block, Sample
 if TYPE_CHECKING:
     from torch.utils import data
 
+S = TypeVar("S", bound=Section)
 BLOCKS_HELD = 4  # shards whose demos a shuffled stream mixes
 
 
@@ -84,6 +87,16 @@ class Dataset:
     def recipe(self) -> dict[str, Any]:
         """The resolved recipe."""
         return self.manifest.recipe
+
+    def section(self, name: str, kind: type[S]) -> S:
+        """A section of the recipe; a FormatError if there is none that this version knows."""
+        try:
+            return kind.model_validate_json(json.dumps(self.recipe.get(name, {})))
+        except ValueError as error:
+            where = f"{self.root / manifest.MANIFEST}: recipe.{name}"
+            raise FormatError(
+                f"{where}: {' '.join(str(error).split())[:200]}; read it with the dapdata that made it"
+            ) from error
 
     @property
     def task(self) -> str:

@@ -69,22 +69,23 @@ def run_again(look: Look, command: Command, content: str) -> None:
     assert not (root / manifest.PROGRESS).exists()
 
 
-def survived(commands: dict[str, Command], scratch: Path, every: bool = False) -> Counter[str]:
-    """How many crashes of each kind the commands survived."""
+def survived(commands: dict[str, Command], scratch: Path, every: bool = False, step: int = 1) -> Counter[str]:
+    """How many crashes of each kind the commands survived; of all that were to be survived, each `step`-th."""
     root, counts = scratch / "toy", Counter[str]()
     for name, command in commands.items():
         looks = crashes(lambda command=command: command(root), root, scratch / name, every)
         content = manifest.read(root).content_sha256
-        for look in looks:
+        for look in looks[::step]:
             run_again(look, command, content)
             shutil.rmtree(look.folder)
             counts[look.kind] += 1
     return counts
 
 
-def test_after_a_crash_anywhere_the_same_command_ends_well(in_memory: Path) -> None:
-    """Before every call after which something else is on the disk."""
-    assert survived(SMALL, in_memory).total() > 50
+def test_after_a_crash_the_same_command_ends_well(in_memory: Path) -> None:
+    """Before calls after which something else is on the disk: a third of them."""
+    counts = survived(SMALL, in_memory, step=3)
+    assert min(counts["killed"], counts["cut"]) > 7
 
 
 @pytest.mark.slow

@@ -12,7 +12,7 @@ from elsewhere import ELSEWHERE, elsewhere  # noqa: E402
 from safetensors.torch import load_file  # noqa: E402
 from training_samples import RULE, TINY, make_sample  # noqa: E402
 
-from daptrain import affordance, checkpoint, layers, loop, pose  # noqa: E402
+from daptrain import affordance, layers, loop, pose  # noqa: E402
 from daptrain.prepare import pose_item, prepare, reference_rotation  # noqa: E402
 
 pytestmark = pytest.mark.filterwarnings("ignore:for .* copying from a non-meta parameter")  # it is copied all the same

@@ -38,7 +38,7 @@ def killed(network, optimizer, material, config, number, *rest):
         os.kill(os.getpid(), signal.SIGKILL)
     return step(network, optimizer, material, config, number, *rest)
 loop.train_step, loop.CHECKPOINT_SECONDS, loop.LOG_EVERY = killed, 0.0, 5
-loop.train(dataset, run, steps=steps, device="cpu", config=TINY)
+loop.train(dataset, run, steps=steps, device="cpu", config=TINY, net=sys.argv[6])
 """
 
 
@@ -75,19 +75,19 @@ def losses(run: Path) -> list[tuple[str, int, float]]:
 # Kills -------------------------------------------------------------------------------------------------------
 
 
-def killed(dataset: Path, run: Path, steps: int, rng: np.random.Generator) -> None:
-    """One life of a run, killed at a random step of either network."""
-    net, at = ("affordance", "pose")[int(rng.integers(2))], int(rng.integers(steps))
-    command = [sys.executable, "-c", KILLED, str(dataset), str(run), str(steps), net, str(at)]
+def killed(dataset: Path, run: Path, steps: int, net: str, rng: np.random.Generator) -> None:
+    """One life of a run, killed at a random step of its network, or of either of both."""
+    where, at = str(rng.choice(["affordance", "pose"])) if net == "both" else net, int(rng.integers(1, steps))
+    command = [sys.executable, "-c", KILLED, str(dataset), str(run), str(steps), where, str(at), net]
     done = subprocess.run(command, env=ENVIRONMENT, capture_output=True, check=False)
     # A network that was past that step already is done in peace.
     assert done.returncode in (-signal.SIGKILL, 0), done.stderr
 
 
 def test_a_training_killed_at_a_random_step_ends_with_the_bits_of_one_that_was_not(dataset: Path, tmp_path: Path) -> None:
-    whole, run = train(dataset, tmp_path / "whole", 12), tmp_path / "killed"
-    killed(dataset, run, 12, np.random.default_rng(0))
-    train(dataset, run, 12)
+    whole, run = train(dataset, tmp_path / "whole", 12, "pose"), tmp_path / "killed"
+    killed(dataset, run, 12, "pose", np.random.default_rng(0))
+    train(dataset, run, 12, "pose")
     assert weights(run) == weights(whole)
     assert losses(run) == losses(whole)
 
@@ -98,7 +98,7 @@ def test_trainings_killed_ten_times_end_with_the_bits_of_one_that_was_not(datase
     for series in range(3):
         run, rng = tmp_path / str(series), np.random.default_rng(100 + series)
         for _ in range(4):
-            killed(dataset, run, 60, rng)
+            killed(dataset, run, 60, "both", rng)
         train(dataset, run, 60)
         assert weights(run) == weights(whole)
         assert losses(run) == losses(whole)
@@ -145,16 +145,16 @@ def test_a_training_of_both_networks_cut_off_at_any_call_goes_on(
 
 
 def test_a_full_disk_leaves_the_last_checkpoint_and_says_so(dataset: Path, in_memory: Path) -> None:
-    run = train(dataset, in_memory / "run", 5, "pose")
+    run = train(dataset, in_memory / "run", 1, "pose")
     before = {path.name: path.read_bytes() for path in run.glob("*.safetensors")}
     whole = Path(shutil.copytree(run, in_memory / "whole"))
     with files_of_at_most(20_000), pytest.raises(EnvironmentProblem, match=r"disk full.*about \d+ MB more.*again") as caught:
-        train(dataset, run, 10, "pose")
+        train(dataset, run, 2, "pose")
     assert caught.value.exit_code == 6
     assert {path.name: path.read_bytes() for path in run.glob("*.safetensors")} == before
     assert not [path for path in run.iterdir() if path.match(durable.TEMPORARY)]
-    train(dataset, run, 10, "pose")
-    assert weights(run) == weights(train(dataset, whole, 10, "pose"))
+    train(dataset, run, 2, "pose")
+    assert weights(run) == weights(train(dataset, whole, 2, "pose"))
 
 
 def test_a_second_training_of_a_run_is_told_who_works(dataset: Path, tmp_path: Path) -> None:

@@ -59,6 +59,9 @@ class Progress:
     minutes: float = 0.0  # largest budget of minutes that was used up
 
 
+PROGRESS = TypeAdapter(Progress)
+
+
 def describe(
     data: str, task: str, digest: str, recipe: dict[str, Any], config: TrainConfig, method: str, device: str
 ) -> dict[str, Any]:
@@ -252,7 +255,7 @@ def _outline(network: Net, has_moments: bool) -> dict[str, Tensor]:
 def _progress(metadata: Mapping[str, Any], path: Path) -> Progress:
     """Where a state stands, as its metadata say."""
     try:
-        return TypeAdapter(Progress).validate_python(metadata["progress"])
+        return PROGRESS.validate_python(metadata["progress"])
     except (KeyError, ValidationError) as error:
         raise CheckpointError(f"{path}: has no progress, expected a state written by this version; delete the run") from error
 

@@ -117,7 +117,7 @@ def curve(
     """
     say = say or (lambda line: print(line, file=sys.stderr, flush=True))
     out, dataset = Path(out), loading.open(data, "train")
-    config = config or TrainConfig.model_validate(dataset.recipe["train"])
+    config = config or dataset.section("train", TrainConfig)
     if method not in LEARNED:
         raise UsageError(f"method: got '{method}', which learns nothing, expected one of {', '.join(LEARNED)}")
     sizes = check_sizes(sizes, dataset)
@@ -175,7 +175,7 @@ def judging_settings(
     if len(dataset) == 0:
         raise UsageError(f"{dataset.root}: split '{split}': got 0 demos, expected at least 1; choose another split")
     given = {"trials": trials, "protocol": protocol, "k": k, "draws": draws}
-    usual = EvalConfig.model_validate(dataset.recipe.get("eval", {})).model_dump()
+    usual = dataset.section("eval", EvalConfig).model_dump()
     found = usual | {name: value for name, value in given.items() if value is not None}
     found["trials"] = min(found["trials"], len(dataset))
     found["draws"] = found["draws"] if draws is not None else max(found["draws"] or found["k"], found["k"])

@@ -34,7 +34,7 @@ from torch import Tensor
 from dapdata import durable
 from dapdata import rng as random
 from dapdata.config import TrainConfig
-from dapdata.errors import UsageError
+from dapdata.errors import FormatError, UsageError
 from dapdata.loading import Dataset
 from daptrain import affordance, diffusion, pose
 from daptrain.affordance import AffordanceNet
@@ -139,7 +139,7 @@ def train(
 
     started = time.monotonic()
     whole, train_split, val_split = (open_dataset(dataset, split=split) for split in (None, "train", "val"))
-    config = config or TrainConfig.model_validate(whole.recipe["train"])
+    config = config or whole.section("train", TrainConfig)
     check_budget(minutes, steps)
     minutes = config.minutes if minutes is None and steps is None else minutes
     run, where, task = Path(run), pick_device(device), whole.task
@@ -169,7 +169,7 @@ def train(
 
 def learned_from(whole: Dataset, train_split: Dataset, val_split: Dataset, demos: int, config: TrainConfig) -> Material:
     """The first demos of the train split, and those of the val split that are looked at while training."""
-    rule = LabelRule(whole.recipe["label"]["eps_place"], whole.recipe["label"]["kind"])
+    rule = label_rule(whole)
     every_goal = config.model_copy(update={"goals": "all"})  # validation asks whether a sample is any valid goal
     return Material(
         prepared(train_split, demos, rule, config),
@@ -178,6 +178,18 @@ def learned_from(whole: Dataset, train_split: Dataset, val_split: Dataset, demos
         int(whole.recipe["seed"]),
         whole.task,
     )
+
+
+def label_rule(dataset: Dataset) -> LabelRule:
+    """How a dataset labelled affordance; a FormatError if its recipe does not say."""
+    label = dataset.recipe.get("label")
+    if (
+        not isinstance(label, dict)
+        or not isinstance(label.get("eps_place"), float)
+        or label.get("kind") not in ("hard", "soft")
+    ):
+        raise FormatError(f"{dataset.root}: recipe.label: got {label!r:.80}, expected eps_place and kind; label it again")
+    return LabelRule(label["eps_place"], label["kind"])
 
 
 def fit_all(

@@ -28,7 +28,7 @@ import numpy as np
 from dapdata import durable, manifest, remote, sense, split, stages, store
 from dapdata.errors import CorruptionError
 from dapdata.manifest import Manifest, UnitEntry
-from dapdata.records import LATER, Array
+from dapdata.records import LATER, Array, Mesh, meshes_in
 from dapdata.schemas import shard_schema
 from dapdata.stages import Unit
 from dapdata.tables import Index
@@ -37,7 +37,7 @@ from dapdata.units import index_row
 OWN_FILES = (manifest.MANIFEST, manifest.PROGRESS, manifest.LOG, durable.LOCK)  # of the machinery, not of the data
 OWN_FOLDERS = (durable.STAGING, "stages", "shards", "quarantine", manifest.PREVIEWS)
 INSTANCES = ("container_instance", "object_instance")
-GEOMETRY = {  # arrays that say what a container with its clutter, or an object, is like
+GEOMETRY = {  # arrays that say what a container with its clutter, or an object, is like, besides meshes
     "container": ("scene/kind", "scene/size", "scene/T_container_part"),
     "object": ("object_parts/kind", "object_parts/size", "object_parts/T_object_part"),
 }
@@ -280,10 +280,10 @@ def _decoded(root: Path, entry: UnitEntry, record: Record, stage: str | None, se
         found = [*_as_written(sample, row), *store.problems(sample)]
         if stage is None:
             found += [*_as_told(sample, row), *sense.nonsense(sample), *_as_upstream(sample, row["demo"], seen)]
-            for body, paths in GEOMETRY.items():
+            for (body, paths), meshes in zip(GEOMETRY.items(), meshes_in(sample)):
                 if len(sample[paths[0]]) and seen.demos < len(seen.parts):
                     digests, parts = seen.geometry[body]
-                    digests.append(_geometry(sample, paths))
+                    digests.append(_geometry(sample, paths, meshes))
                     parts.append(seen.parts[seen.demos])
             seen.demos += 1
         else:
@@ -309,11 +309,11 @@ def _as_upstream(sample: store.Sample, demo: int, seen: _Seen) -> Iterator[str]:
             yield f"what stage {stage} made is not what its own unit holds"
 
 
-def _geometry(sample: store.Sample, paths: tuple[str, ...]) -> int:
+def _geometry(sample: store.Sample, paths: tuple[str, ...], meshes: Iterable[Mesh | None]) -> int:
     """A digest, 64 bits of it, of all that says what a body is like."""
     total = sha256()
-    for path in (*paths, *sorted(path for path in sample if path.startswith("mesh_"))):
-        total.update(sample[path].tobytes())
+    for what in (*(sample[path] for path in paths), *chain(*filter(None, meshes))):
+        total.update(what.tobytes())
     return int.from_bytes(total.digest()[:8])
 
 

@@ -434,6 +434,9 @@ def evaluate(
         list[str] | None,
         _option("--set", help="Override of a train key that acts at inference (--curve: of any)", metavar="KEY=VALUE"),
     ] = None,
+    fast: Annotated[
+        bool, typer.Option("--fast", help="Few steps of sampling (train.sample_steps=3): quicker, a little less accurate.")
+    ] = False,
     curve: Annotated[
         str | None,
         _option("--curve", help="Train anew on so many demos each, such as 10,20,40, and judge them all", metavar="N,N,..."),
@@ -455,11 +458,14 @@ def evaluate(
     as_json: Json = False,
 ) -> None:
     """Predict on a split, then judge in physics. Writes predictions.npz, report.json, report.html, pictures of failures."""
+    from dapdata.config import FAST
     from daptrain import evaluate as evaluate_run
     from daptrain.checkpoint import read_description
 
     judging: dict[str, Any] = {"split": split, "trials": trials, "protocol": protocol, "k": k, "draws": draws, "device": device}
     if curve is not None:
+        if fast:
+            raise UsageError("--fast: is of one report; with --curve give --set train.sample_steps=3")
         asked = judging | {"minutes": minutes, "steps": steps, "workers": _count(workers)}
         _evaluate_curve(curve, run, data, out, overrides, method, as_json, asked)
         return
@@ -472,7 +478,7 @@ def evaluate(
         out = out or run.parent / f"{method}-{run.name}"
     elif data is None:
         data = last("dataset", None)
-    changes = _train_keys(overrides)
+    changes = (FAST if fast else {}) | _train_keys(overrides)
     report = evaluate_run(run, data, method=method, changes=changes, workers=_count(workers), out=out, **judging)
     if run is not None:
         remember(run=run)
@@ -607,6 +613,8 @@ def run(
 
 # Other formats ---------------------------------------------------------------------------------------------
 
+imports = typer.Typer(no_args_is_help=True, rich_markup_mode=None, epilog="Example: dapdata import rpdiff DEMOS --meshes DIR")
+app.add_typer(imports, name="import", help="Make a dataset of demos in the format of other tools.")
 exports = typer.Typer(no_args_is_help=True, rich_markup_mode=None, epilog="Example: dapdata export parquet DATASET --out DIR")
 app.add_typer(exports, name="export", help="Write a dataset in the format of other tools.")
 
@@ -614,6 +622,48 @@ Target = Annotated[Path, _option("--out", help="Folder to write; must be new or 
 OneSplit = Annotated[Split | None, _option("--split", help="Only this split", default="all, each in files of its own")]
 AtMost = Annotated[int | None, _option("--demos", help="Only so many demos, the first ones", default="all", min=1, metavar="N")]
 InFile = Annotated[int | None, _option("--shard-size", help="Demos in a file", default="the format's", min=1, metavar="N")]
+
+
+@imports.command("rpdiff", epilog="Example: dapdata import rpdiff book_chunked --meshes descriptions/objects --out data/books")
+def import_rpdiff(
+    source: Annotated[Path, typer.Argument(help="demo_aug_*.npz, single or in chunks: a file, or a folder with all below it.")],
+    out: Out = None,
+    meshes: Annotated[
+        Path | None,
+        _option(
+            "--meshes", help="Folder with the meshes and slot files", default="none: goals stay as commanded", metavar="DIR"
+        ),
+    ] = None,
+    demos: Demos = None,
+    workers: Workers = None,
+    engine: Engine = "local",
+    memory: Memory = None,
+    allow_missing: AllowMissing = False,
+    overrides: Overrides = None,
+    dry_run: DryRun = False,
+    fresh: Fresh = False,
+    as_json: Json = False,
+) -> None:
+    """Demos of RPDiff, or in its layout (AnyPlace). Goals are settled and checked again. Goes on where it stopped."""
+    from dapdata.imports import rpdiff_recipe
+
+    asked = rpdiff_recipe(source, meshes, demos, overrides or ())
+    means = {"workers": workers, "engine": engine, "memory": memory, "allow_missing": allow_missing, "fresh": fresh}
+    _import(asked, out, dry_run, as_json, **means)
+
+
+def _import(asked: Any, out: str | None, dry_run: bool, as_json: bool, **means: Any) -> None:
+    """Runs a recipe that imports, and says how many demos came in."""
+    from dapdata import health
+    from dapdata.imports import run
+
+    with progress("import", "demo") as advance:
+        made = run(asked, out, dry_run=dry_run, progress=None if dry_run else advance, **means)
+    if isinstance(made, str | Path):
+        rejected = health.inspect(made).to_dict()["rejects"]["demos"]
+        told = "".join(f", {count} {reason}" for reason, count in rejected.items())
+        say(f"imported {asked.demos - sum(rejected.values())} of {asked.demos} demos{told}; next: dapdata label {made}")
+    _show_made(made, as_json, None)
 
 
 @exports.command("webdataset", epilog="Example: dapdata export webdataset data/can_cabinet --out tars --shard-size 200")
@@ -665,6 +715,19 @@ def export_scenes(
 ) -> None:
     """GLB and URDF of the true scenes. Container and clutter, the object, every goal as a frame."""
     _export("scenes", dataset, out, as_json, split=split, demos=demos)
+
+
+@exports.command("rpdiff", epilog="Example: dapdata export rpdiff data/can_cabinet --out rpdiff/can_cabinet_chunked")
+def export_rpdiff(
+    out: Target,
+    dataset: LastDataset = None,
+    split: OneSplit = None,
+    demos: AtMost = None,
+    shard_size: InFile = None,
+    as_json: Json = False,
+) -> None:
+    """Chunks that RPDiff's own loader reads. With split lists and meshes; 9 demos in a file."""
+    _export("rpdiff", dataset, out, as_json, split=split, demos=demos, shard_size=shard_size)
 
 
 def _export(kind: str, dataset: str | None, out: Path, as_json: bool, **options: Any) -> None:

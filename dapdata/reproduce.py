@@ -30,7 +30,7 @@ def reproduce(
     engine: str = "local",
     memory: float | None = None,
     progress: Progress | None = None,
-    table: str = pipeline.__name__,
+    table: str | None = None,
 ) -> tuple[int, list[str]]:
     """How many units were made anew, and what of them came out otherwise, each as "unit: found, expected".
 
@@ -41,14 +41,17 @@ def reproduce(
         engine: Where they work, see engines/.
         memory: What each of them may take, GB; by default an equal part of most of what there is.
         progress: Called with units done and units in all.
-        table: Module with STAGES and parse, as in `pipeline.generate`.
+        table: As in `pipeline.generate`.
 
     Raises:
         UsageError: if the recipe is none for this version.
         MissingExtraError: if a package is missing.
     """
     root = Path(root)
-    found, known = manifest.read(root), import_module(table).STAGES
+    found = manifest.read(root)
+    given = recipe.from_resolved(found.recipe)
+    table = table or given.scene.stages
+    known = import_module(table).STAGES
     wanted: list[Stage] = [stage for stage in known if stage.name in found.stages and found.stages[stage.name].units]
     pipeline.check_packages(wanted)
     if count < 1:
@@ -58,8 +61,8 @@ def reproduce(
     every = [unit for unit in all_units if (unit.start, unit.stop) not in missing]
     order = rng.stream(found.recipe["seed"], "verify", 0).permutation(len(every))
     chosen = [every[i] for i in sorted(order[:count].tolist())]
-    resolved = recipe.resolve(import_module(table).parse(found.recipe))
-    specs, names = stages.specs(known, resolved), tuple(stage.name for stage in wanted)
+    resolved, names = recipe.resolve(given), tuple(stage.name for stage in wanted)
+    specs = stages.specs(known, resolved)
     problems: list[str] = []
     with tempfile.TemporaryDirectory(prefix="dapdata-") as scratch:
         place = {unit: (unit.index, unit.start, unit.stop) for unit in chosen}

@@ -13,17 +13,16 @@ import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from dapdata import card, croissant, durable, manifest, remote, rng, split, store
+from dapdata import card, croissant, durable, manifest, remote, split, store
 from dapdata.config import SplitConfig
 from dapdata.errors import CorruptionError, DapdataError, EnvironmentProblem, UsageError
 from dapdata.manifest import Manifest, MissingEntry, Rejects, SplitEntry, StageEntry, UnitEntry
 from dapdata.records import Demo, Record, Rejected, read_record, to_sample
-from dapdata.stages import Layout, Spec, Stage, Unit, changes, specs
+from dapdata.stages import Draw, Layout, Spec, Stage, Unit, changes, specs
 from dapdata.tables import Index, insert_words, writer
 
 CALL = "dapdata.units:run_unit"
@@ -139,8 +138,7 @@ def _run_stage(stage: Stage, recipe: Any, made: Mapping[str, Made], unit: Unit) 
         inputs = {need: made[need][demo] for need in stage.needs}
         reasons: Counter[str] = Counter()
         for attempt in range(stage.attempts):
-            draw = partial(_draw, recipe.seed, demo, attempt)
-            result = stage.run(inputs, sections, draw)
+            result = stage.run(inputs, sections, Draw(recipe.seed, demo, attempt))
             if not isinstance(result, Rejected):
                 records[demo] = _finished(result, recipe.seed, demo, attempt)
                 break
@@ -152,10 +150,6 @@ def _run_stage(stage: Stage, recipe: Any, made: Mapping[str, Made], unit: Unit) 
         else:
             rejects["attempts"] += reasons
     return records, rejects
-
-
-def _draw(seed: int, demo: int, attempt: int, purpose: str) -> Any:
-    return rng.stream(seed, purpose, demo, attempt)
 
 
 def _finished(record: Record, seed: int, demo: int, attempt: int) -> Record:

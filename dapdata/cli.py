@@ -26,6 +26,7 @@ from dapdata.console import (
     last,
     made_text,
     placements_text,
+    printable,
     progress,
     remember,
     report_text,
@@ -146,7 +147,7 @@ def run_app(arguments: Sequence[str]) -> int:
 
 
 def _fail(message: str, code: int) -> int:
-    print(message, file=sys.stderr)
+    print(printable(message), file=sys.stderr)
     return code
 
 
@@ -317,18 +318,29 @@ def inspect(dataset: LastDataset = None, as_json: Json = False) -> None:
     show(found.to_dict(), as_json, str(found))
 
 
-@app.command(epilog="Example: dapdata verify data/can_cabinet")
+@app.command(epilog="Example: dapdata verify data/can_cabinet --deep --reproduce 2")
 def verify(
     dataset: LastDataset = None,
     quick: Annotated[bool, typer.Option("--quick", help="Only compare files with their hashes.")] = False,
+    deep: Annotated[bool, typer.Option("--deep", help="Decode cached units too, compare everything with everything.")] = False,
+    reproduce: Annotated[
+        int | None, _option("--reproduce", help="Also make so many units anew from the recipe, and compare", min=1, metavar="K")
+    ] = None,
+    workers: Workers = None,
     as_json: Json = False,
 ) -> int:
-    """Say whether it is whole. Each file by its hash, each array by its content, splits that share nothing."""
+    """Say whether it is whole. Each file by its hash, each demo by its content and its sense, splits that share nothing."""
     from dapdata import health
+    from dapdata.reproduce import reproduce as make_anew
 
+    if quick and deep:
+        raise UsageError("--quick, --deep: one looks at files alone, the other at everything; give one of them")
     folder = last("dataset", dataset)
     with progress("verify", "unit") as advance:
-        found = health.verify(folder, quick=quick, progress=advance)
+        found = health.verify(folder, quick=quick, deep=deep, progress=advance)
+    if reproduce is not None and found.ok:
+        with progress("reproduce", "unit") as advance:
+            found = found.with_reproduced(*make_anew(folder, reproduce, workers=_count(workers), progress=advance))
     show(found.to_dict(), as_json, str(found))
     return 0 if found.ok else 3
 

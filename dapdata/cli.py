@@ -13,6 +13,7 @@ import os
 import shutil
 import signal
 import sys
+from collections import Counter
 from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
@@ -37,6 +38,7 @@ from dapdata.console import (
 from dapdata.errors import DapdataError, UsageError, require
 
 CLICK_ERROR: type[Exception] = typer.BadParameter.__mro__[2]  # ClickException, of all bad arguments; not exported
+TOLD = 10  # rejected demos of an import that are told one by one
 STOPPED, INTERRUPTED = "stopped; the same command, run again, goes on where it stopped", 130
 
 Net = Literal["both", "affordance", "pose"]
@@ -659,11 +661,18 @@ def _import(asked: Any, out: str | None, dry_run: bool, as_json: bool, **means: 
 
     with progress("import", "demo") as advance:
         made = run(asked, out, dry_run=dry_run, progress=None if dry_run else advance, **means)
-    if isinstance(made, str | Path):
-        rejected = health.inspect(made).to_dict()["rejects"]["demos"]
-        told = "".join(f", {count} {reason}" for reason, count in rejected.items())
-        say(f"imported {asked.demos - sum(rejected.values())} of {asked.demos} demos{told}; next: dapdata label {made}")
-    _show_made(made, as_json, None)
+    if not isinstance(made, str | Path):
+        show(made.to_dict(), as_json, str(made))
+        return
+    rejected = health.rejected(made)
+    for told in rejected[:TOLD]:
+        say(f"rejected demo {told['demo']}, {told['reason']}: {told['detail']}")
+    if len(rejected) > TOLD:
+        say(f"rejected {len(rejected) - TOLD} more; --json tells all")
+    counts = "".join(f", {count} {reason}" for reason, count in Counter(told["reason"] for told in rejected).items())
+    say(f"imported {asked.demos - len(rejected)} of {asked.demos} demos{counts}; next: dapdata label {made}")
+    remember(dataset=made)
+    show({"dataset": str(made), "demos": asked.demos, "rejected": rejected}, as_json, str(made))
 
 
 @exports.command("webdataset", epilog="Example: dapdata export webdataset data/can_cabinet --out tars --shard-size 200")

@@ -18,7 +18,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from dapdata import pipeline, recipe, remote
+from dapdata import health, manifest, pipeline, recipe, remote
 from dapdata.errors import UsageError
 from dapdata.interop import rpdiff_clouds, rpdiff_files, rpdiff_scenes
 from dapdata.plan import Plan
@@ -89,7 +89,9 @@ def run(asked: Recipe, out: Place | None, **options: Any) -> Place | Plan:
     is_new = isinstance(place, Path) and not place.exists()
     try:
         return pipeline.generate(asked, place, **options)
-    except UsageError:
-        if is_new and isinstance(place, Path) and place.exists():
-            shutil.rmtree(place)
-        raise
+    except UsageError as error:
+        if not (is_new and isinstance(place, Path) and place.exists()):
+            raise
+        first = health.rejected(place)[:1] if (place / manifest.MANIFEST).exists() else []
+        shutil.rmtree(place)
+        raise UsageError("; ".join([str(error), *(f"demo {told['demo']}: {told['detail']}" for told in first)])) from error

@@ -35,6 +35,10 @@ NEARLY_CONVEX = 0.1  # share by which the hull of an object's piece may be large
 SHARP = np.radians(30)  # between faces: a sharper edge is seen as one
 
 
+class TooLargeError(FormatError):
+    """A mesh of more bytes or faces than are kept in a demo."""
+
+
 # Reading ---------------------------------------------------------------------------------------------------
 
 
@@ -42,7 +46,8 @@ def read_mesh(path: Path) -> Mesh:
     """The triangles of an obj, ply, stl or off file.
 
     Raises:
-        FormatError: no such file, another format, a header that does not fit, too many faces, numbers that are not finite,
+        TooLargeError: too many bytes or faces.
+        FormatError: no such file, another format, a header that does not fit, numbers that are not finite,
             faces of vertices that are not there, no area, or a size that cannot be metres.
         MissingExtraError: trimesh is not installed.
     """
@@ -53,7 +58,7 @@ def read_mesh(path: Path) -> Mesh:
     try:
         size = path.stat().st_size
         if size > MAX_BYTES:
-            raise FormatError(f"{path}: {size} bytes, expected {MAX_BYTES} at the most; decimate the mesh")
+            raise TooLargeError(f"{path}: {size} bytes, expected {MAX_BYTES} at the most; decimate the mesh")
         data = path.read_bytes()
     except OSError as error:
         raise FormatError(f"{path}: cannot be read ({error.strerror or error}), expected a mesh") from error
@@ -66,6 +71,8 @@ def read_mesh(path: Path) -> Mesh:
         raise
     except Exception as error:  # trimesh's readers raise whatever numpy, struct and str raise on broken text
         raise FormatError(f"{path}: is no {kind[1:]} file with triangles ({type(error).__name__}), expected a mesh") from error
+    if len(faces) > MAX_FACES or len(vertices) > 3 * MAX_FACES:
+        raise TooLargeError(f"{path}: {len(faces)} faces, expected {MAX_FACES} at the most; decimate the mesh")
     problem = fault(Mesh(vertices, faces))
     if problem:
         raise FormatError(f"{path}: {problem}")

@@ -75,6 +75,7 @@ class Rejected:
     """Why a demo (or an attempt at one) came to nothing: data to be counted, not an error."""
 
     reason: str
+    detail: str = field(default="", compare=False)  # for who looks after it, such as the file or the figure
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,18 @@ from dapdata import meshes, solids, store
 from dapdata.config import RpdiffConfig
 from dapdata.errors import FormatError
 from dapdata.interop import object_arrays
-from dapdata.interop.rpdiff_files import SLOT_SUFFIXES, Fault, Raw, check, mesh_folder, on_table, own, poses_of, read_fields
+from dapdata.interop.rpdiff_files import (
+    SLOT_SUFFIXES,
+    Fault,
+    Raw,
+    check,
+    mesh_folder,
+    on_table,
+    own,
+    poses_of,
+    read_fields,
+    rejected,
+)
 from dapdata.poses import inverse, pose, rotation_about, symmetric_distance, transform
 from dapdata.records import (
     GOAL_KINDS,
@@ -63,10 +74,10 @@ def demonstrate(config: RpdiffConfig, placement: PlacementConfig, demo: int) -> 
         if "dapdata" in found:
             demo_as_exported: MeshDemo = own(found["dapdata"], MeshDemo)
             return demo_as_exported
-        raw = check(found)
+        raw = check(found, config.table_height)
         return _settled(raw, config, placement) if config.meshes else _commanded(raw, config)
     except Fault as fault:
-        return Rejected(str(fault))
+        return rejected(config, demo, fault)
 
 
 def _commanded(raw: Raw, config: RpdiffConfig) -> MeshDemo:
@@ -91,7 +102,7 @@ def _commanded(raw: Raw, config: RpdiffConfig) -> MeshDemo:
     return made
 
 
-def _settled(raw: Raw, config: RpdiffConfig, placement: PlacementConfig) -> MeshDemo | Rejected:
+def _settled(raw: Raw, config: RpdiffConfig, placement: PlacementConfig) -> MeshDemo:
     """The demo with container and object as meshes, and with every goal that holds: the demonstrated one, and free slots."""
     parents, object_ = _meshes(raw, config)
     corners = np.concatenate([mesh.vertices for mesh in object_])
@@ -113,18 +124,23 @@ def _settled(raw: Raw, config: RpdiffConfig, placement: PlacementConfig) -> Mesh
     return _with_goals(scene, _distinct([commanded, *slots], 1e-4, 1e-3, scene), config, placement)
 
 
-def _with_goals(scene: MeshScene, proposed: Array, config: RpdiffConfig, placement: PlacementConfig) -> MeshDemo | Rejected:
-    """The demo of proposed poses (G, 4, 4), container frame, let go and checked; rejected if the first does not hold."""
+def _with_goals(scene: MeshScene, proposed: Array, config: RpdiffConfig, placement: PlacementConfig) -> MeshDemo:
+    """The demo of proposed poses (G, 4, 4), container frame, let go and checked.
+
+    Raises:
+        Fault: the first does not hold.
+    """
     dropped = drop(scene, proposed, placement, config.drop_seconds)
     symmetry = SYMMETRIES[scene.symmetry_kind], scene.symmetry_axis
     came = [symmetric_distance(T, T_from, *symmetry) for T, T_from in zip(dropped, proposed)]
     stayed = [g for g, (shift, turn) in enumerate(came) if shift <= MAX_DROP and turn <= np.radians(placement.max_turn_deg)]
     if 0 not in stayed:
-        return Rejected("moved")
+        shift, turn = came[0]
+        raise Fault("moved", f"the demonstrated goal, by {1000 * shift:.0f} mm and {np.degrees(turn):.0f} degrees when let go")
     chosen = _distinct(dropped[stayed], SAME_GOAL, SAME_TURN, scene)
     settled, reasons = settle(scene, chosen, placement)
     if reasons[0] != "ok":
-        return Rejected(reasons[0])
+        raise Fault(reasons[0], "the demonstrated goal, as it came to rest")
     lost = [g for g in range(len(proposed)) if g not in stayed]
     everything = np.concatenate([chosen, proposed[lost]])
     reasons += ["moved"] * len(lost)
@@ -150,8 +166,11 @@ def _check_meshes(raw: Raw, scene: MeshScene, config: RpdiffConfig) -> None:
     for cloud, T, T_body_part, pieces in zip((raw.points.parent, raw.points.child), T_world, parts, found):
         few = cloud[:: max(1, len(cloud) // CHECKED_POINTS)] - down
         placed = [_moved(mesh, T @ part) for part, mesh in zip(T_body_part, pieces) if mesh is not None]
-        if np.median(meshes.distances(placed, few)) > OFF_MESH:
-            raise Fault("mesh_and_cloud_differ")
+        off = float(np.median(meshes.distances(placed, few)))
+        if off > OFF_MESH:
+            raise Fault(
+                "mesh_and_cloud_differ", f"by {1000 * off:.0f} mm in the median, expected {1000 * OFF_MESH:.0f} at most"
+            )
 
 
 def _scene(
@@ -276,22 +295,22 @@ def _meshes(raw: Raw, config: RpdiffConfig) -> tuple[list[Mesh], list[Mesh]]:
     """The meshes of the containers, and the convex pieces of the object, each in its file's frame."""
     assert config.meshes is not None
     folder = mesh_folder(config.meshes)
-    parents = [_read_mesh(folder.path(named)) for named in raw.mesh_files.parent]
-    path = (folder.path(raw.convex_file) if raw.convex_file else None) or folder.path(raw.mesh_files.child[0])
-    object_ = meshes.convex_pieces(_read_mesh(path))
+    parents = [_read_mesh(folder.path(named), named) for named in raw.mesh_files.parent]
+    named = raw.convex_file if raw.convex_file and folder.path(raw.convex_file) else raw.mesh_files.child[0]
+    object_ = meshes.convex_pieces(_read_mesh(folder.path(named), named))
     if object_ is None:
-        raise Fault("object_not_convex")
+        raise Fault("object_not_convex", named)
     return parents, object_
 
 
 @lru_cache(maxsize=64)
-def _read_mesh(path: Path | None) -> Mesh:
+def _read_mesh(path: Path | None, named: str) -> Mesh:
     if path is None:
-        raise Fault("mesh_missing")
+        raise Fault("mesh_missing", named or "the file names none")
     try:
         return meshes.read_mesh(path)
     except FormatError as error:
-        raise Fault("mesh_broken") from error
+        raise Fault("mesh_too_large" if isinstance(error, meshes.TooLargeError) else "mesh_broken", str(error)) from error
 
 
 def _slots(raw: Raw, config: RpdiffConfig, T_theirs_object: Array, height: float) -> list[Array]:
@@ -310,7 +329,7 @@ def _slots(raw: Raw, config: RpdiffConfig, T_theirs_object: Array, height: float
                     raise ValueError("a slot file of that size")
                 return reader(path, T_theirs_object, height)
             except (Fault, FormatError, OSError, ValueError, KeyError, TypeError) as error:
-                raise Fault("mesh_broken") from error
+                raise Fault("mesh_broken", f"{path.name}: {error}") from error
     return []
 
 

@@ -57,7 +57,7 @@ def steps(
 ) -> Contender:
     """A function that takes the next step of a network of its own."""
     network, step = loop.build(name, config, "dap", material), count()
-    optimizer = torch.optim.AdamW(network.parameters(), lr=RATE, weight_decay=config.weight_decay, fused=True)
+    optimizer = torch.optim.AdamW(network.parameters(), lr=RATE, weight_decay=config.weight_decay)
     if is_compiled:
         network.compile(dynamic=True)
 

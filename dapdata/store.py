@@ -1,4 +1,4 @@
-"""Units on disk: the only door to zarr.
+"""Units on disk: the only door to zarr, which writes them; `chunks` reads them faster than it does.
 
 A unit is one Zarr v3 group that holds some demos: the columns of `records` as concatenated rows, an `offsets`
 array for each ragged group, and in the root's attributes under `dapdata` the unit's own record: key, demos,
@@ -16,7 +16,6 @@ from contextlib import suppress
 from dataclasses import Field, dataclass, field
 from hashlib import sha256
 from importlib.metadata import version
-from math import prod
 from pathlib import Path
 from stat import S_ISDIR, S_ISREG
 from typing import Annotated, Any
@@ -25,7 +24,7 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, ValidationError
 from pydantic import Field as Key
 
-from dapdata import durable
+from dapdata import chunks, durable
 from dapdata.errors import CorruptionError
 from dapdata.records import PART_KINDS, RECORDS, SYMMETRIES, Array, Meshes, Record, columns, is_ragged
 
@@ -41,7 +40,6 @@ POSITIVE = {  # arrays in which nothing is below this
     "scene/size": 0, "object_parts/size": 0, "scene/max_tilt": 0, "goals/clearance": 0, "correspondence/distance": 0,
     "container_superpoints/size": 1, "object_superpoints/size": 1, "meta/demo": 0, "meta/seed": 0,
 }  # fmt: skip
-CODECS = ["bytes", "zstd", "crc32c"]
 
 REVOLUTION = SYMMETRIES.index("revolution")
 
@@ -435,21 +433,18 @@ def read_block(folder: Path, paths: Sequence[str] | None = None) -> Block:
     Raises:
         CorruptionError: if an array is missing or a chunk fails its checksum.
     """
-    import zarr
-
     arrays: dict[str, Array] = {}
-    path = "zarr.json"
+    record, path = read_record(folder), "files"
     try:
-        record = read_record(folder)
-        group: Any = zarr.open_group(folder, mode="r")
         wanted = stored_paths(record) if paths is None else _with_offsets(paths)
         names = {*files_of(record, paths)}
-        _check_arrays(group, wanted, names, _check_files(folder, names))
-        for path in wanted:
-            arrays[path] = group[path][...]
+        layouts = _layouts(folder, wanted, names, _check_files(folder, names))
+        for path, layout in layouts.items():
+            data = (folder / path / layout.name).read_bytes() if layout.shape[0] else None
+            arrays[path] = np.empty(layout.shape, layout.dtype) if data is None else chunks.decode(layout, data)
         for path in wanted:
             _check_rows(path, arrays, len(record["rows"]))
-    except Exception as error:  # there is no end to what zarr and its codecs raise at bytes that are not theirs
+    except Exception as error:  # there is no end to what codecs raise at bytes that are not theirs
         raise CorruptionError(
             f"{folder}: {path}: cannot be decoded ({_one_line(error)}), expected what was written; run `dapdata verify`"
         ) from error
@@ -475,36 +470,43 @@ def stored_paths(record: Mapping[str, Any]) -> list[str]:
 def _check_files(folder: Path, names: Set[str]) -> int:
     """The size of a unit's files, bytes; raises unless all are there, and the folders between lead nowhere else."""
     for parent in {name.rsplit("/", up)[0] for name in names for up in range(1, name.count("/") + 1)}:
-        if not S_ISDIR((folder / parent).lstat().st_mode):
+        if not S_ISDIR(_stat(folder, parent).st_mode):
             raise ValueError(f"{parent}: expected a folder")
     total = 0
     for name in names:
-        about = (folder / name).lstat()
+        about = _stat(folder, name)
         if not S_ISREG(about.st_mode):
             raise ValueError(f"{name}: expected a plain file")
         total += about.st_size
     return total
 
 
-def _check_arrays(group: Any, paths: Sequence[str], names: Set[str], stored: int) -> None:
-    """Raises a ValueError if arrays are others than they should be, or would take more memory than their files explain.
+def _stat(folder: Path, name: str) -> os.stat_result:
+    try:
+        return (folder / name).lstat()
+    except FileNotFoundError:
+        raise FileNotFoundError(f"{name}: missing") from None
 
-    zarr reads a chunk that isn't there as fill values, so that one file of each array is looked for.
-    """
-    limit, total = max(SMALL, MAX_RATIO * stored), 0
+
+def _layouts(folder: Path, paths: Sequence[str], names: Set[str], stored: int) -> dict[str, chunks.Layout]:
+    """How arrays are laid out; raises if they are others than they should be, or larger than their files explain."""
+    limit, total, found = max(SMALL, MAX_RATIO * stored), 0, {}
     for path in paths:
-        array, about = group[path], _about(path)
+        try:
+            array = chunks.layout((folder / path / "zarr.json").read_bytes())
+        except Exception as error:  # whatever json says, and what is not where it should be in it
+            raise ValueError(f"{path}: {_one_line(error)}") from error
+        about = _about(path)
         fixed = about["dims"][1:]
-        if array.dtype.str != about["dtype"] or array.shape[1:] != fixed or array.ndim != 1 + len(fixed):
+        if array.dtype.str != about["dtype"] or array.shape[1:] != fixed:
             raise ValueError(f"{path}: {array.dtype} {array.shape}, expected {about['dtype']} {(about['dims'][0], *fixed)}")
-        chunk = array.shards or array.chunks
-        if chunk[0] < array.shape[0] or chunk[1:] != array.shape[1:]:
-            raise ValueError(f"{path}: chunks of {chunk}, expected the whole of {array.shape} in one file")
-        if array.shape[0] and f"{path}/{array.metadata.encode_chunk_key((0,) * array.ndim)}" not in names:
+        if array.shape[0] and f"{path}/{array.name}" not in names:
             raise FileNotFoundError(f"{path}: its rows are missing")
-        total += array.dtype.itemsize * prod(chunk)
+        total += array.nbytes
         if total > limit:
             raise ValueError(f"{path}: {total} bytes in {stored} bytes of files")
+        found[path] = array
+    return found
 
 
 def _check_rows(path: str, arrays: Mapping[str, Array], demos: int) -> None:
@@ -538,7 +540,7 @@ def misdescribed(folder: Path) -> Iterator[str]:
     for path, about in found.items():
         codecs = [codec["name"] for codec in about["codecs"][0].get("configuration", {}).get("codecs", ())]
         told = {**about["attributes"], "dimension_names": list(about.get("dimension_names") or ()), "codecs": codecs}
-        expected = {**_attributes(_about(path)), "dimension_names": _dimension_names(_about(path)), "codecs": CODECS}
+        expected = {**_attributes(_about(path)), "dimension_names": _dimension_names(_about(path)), "codecs": [*chunks.CODECS]}
         for name in sorted((told | expected).keys() - {"description"}):
             if not _says(told.get(name), expected.get(name), grows=name == "names"):
                 yield f"{path}: {name} {told.get(name)!r}, expected {expected.get(name)!r}"

@@ -19,7 +19,7 @@ DAPTRAIN = sorted((ROOT / "train/daptrain").rglob("*.py"))
 # stage, in engines, which is one interface, in interop, and in tasks/mixed.py, which is made of the other tasks.
 LINES = (
     ("errors", "rng", "poses", "config"),
-    ("records", "strict_yaml", "durable", "npz", "console"),
+    ("records", "strict_yaml", "durable", "npz", "chunks", "console"),
     ("solids", "keys", "slic", "split", "matching", "tables", "buckets", "sense", "clouds"),
     ("meshes", "tabletop"),
     ("tasks",),
@@ -52,6 +52,8 @@ DAPTRAIN_MAY_KNOW = {
 DOORS = {
     "pybullet": {"simulate"},
     "zarr": {"store"},
+    "numcodecs": {"chunks"},
+    "google_crc32c": {"chunks"},
     "open3d": {"meshes"},
     "typer": {"cli"},
     "trimesh": {"solids", "meshes"},

@@ -612,7 +612,7 @@ def test_a_reader_is_told_which_shard_is_damaged(memory: Folder, small: Path) ->
     data = dapdata.open(memory.url)
     one, other = (shard.path for shard in data.manifest.shards)
     memory.remove([f"{one}/goals/kind/c/0"])
-    with pytest.raises(CorruptionError, match=re.escape(f"{memory.url}/{one}: goals/kind")):
+    with pytest.raises(CorruptionError, match=re.escape(f"{memory.url}/{one}: files: cannot be decoded (goals/kind")):
         data.block(one)
     memory.remove([f"{other}/zarr.json"])
     with pytest.raises(CorruptionError, match=re.escape(f"{memory.url}/{other}: missing, expected a shard")):

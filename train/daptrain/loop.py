@@ -294,7 +294,7 @@ def fit(
     if not any((example.targets.affordance > 0).any() for example in material.train):
         raise UsageError(f"{run}: no demo of the train split has a container point near its goal; generate more demos")
     network = build(name, config, method, material).to(device)
-    optimizer = torch.optim.AdamW(network.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay, fused=True)
+    optimizer = torch.optim.AdamW(network.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay)
     average = {key: value.detach().clone() for key, value in network.named_parameters()}
     progress = load_state(run, network, optimizer, average)
     budget.before, budget.started = progress.seconds, time.monotonic()

@@ -438,7 +438,7 @@ def test_an_index_of_fewer_or_more_demos_than_the_shards_have_is_found(
     golden_copy: Path, change: Callable[[list[dict[str, Any]]], object]
 ) -> None:
     forge_index(golden_copy, change)
-    assert health.verify(golden_copy).problems == ("index.parquet: its rows are not the demos of the shards",)
+    assert "index.parquet: its rows are not the demos of the shards" in health.verify(golden_copy).problems
 
 
 def test_an_index_that_names_a_shard_elsewhere_is_not_followed(golden_copy: Path, in_memory: Path) -> None:

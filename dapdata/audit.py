@@ -2,8 +2,8 @@
 
 It looks at three depths. Quick: every file against its hash, and every claim of the manifest and the units' records
 against each other. As it is by default: the shards decoded as well, each demo against its digest and against what must
-hold of it (`store.problems`, `sense.nonsense`). Deep: the cached units too, their keys computed anew, what arrays say of
-themselves, and what only all demos together can tell, such as a geometry that two splits share.
+hold of it (`store.problems`, `sense.nonsense`), and all bodies against each other, for a geometry that two splits share.
+Deep: the cached units too, what shards hold against them, their keys computed anew, and what arrays say of themselves.
 
 Nothing that is read is trusted: files are compared with their hashes before anything is decoded, and whatever is wrong
 becomes a line of the report, never a traceback.
@@ -19,7 +19,7 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from hashlib import sha256
 from heapq import merge
-from itertools import chain
+from itertools import chain, zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -278,8 +278,9 @@ def _decoded(root: Path, entry: UnitEntry, record: Record, stage: str | None, se
         sample = block.sample(number)
         found = [*_as_written(sample, row), *store.problems(sample)]
         if stage is None:
-            found += [*_as_told(sample, row), *sense.nonsense(sample), *_as_upstream(sample, row["demo"], seen)]
-            for (body, paths), meshes in zip(GEOMETRY.items(), meshes_in(sample)):
+            found += [*_as_told(sample, row), *_as_upstream(sample, row["demo"], seen)]
+            found += () if found else sense.nonsense(sample)
+            for (body, paths), meshes in () if found else zip(GEOMETRY.items(), meshes_in(sample)):
                 if len(sample[paths[0]]):
                     digests, demos = seen.geometry[body]
                     digests.append(_geometry(sample, paths, meshes))
@@ -331,7 +332,8 @@ def _lists(root: Path, found: Manifest) -> Iterator[str]:
     shard_stage = _shard_stage(found)
     made = found.stages[shard_stage].units if shard_stage else []
     made = made if any(entry.demos for entry in made) else []  # units without a demo, each rejected, are no shards
-    if list(found.shards) != list(made) or manifest.listed_shards(root) != [_named(entry) for entry in made]:
+    shards = zip_longest(found.shards, made, manifest.listed_shards(root))
+    if any(entry is None or entry != other or _named(entry) != listed for entry, other, listed in shards):
         yield "manifest.json: the shards are not the units of a stage"
     ranges = [(unit.start, unit.stop) for unit in stages.units(found.recipe["demos"], found.recipe["shard_size"])]
     spared = {entry.demo_range for entry in found.missing}

@@ -2,8 +2,8 @@
 
 It looks at three depths. Quick: every file against its hash, and every claim of the manifest and the units' records
 against each other. As it is by default: the shards decoded as well, each demo against its digest and against what must
-hold of it (`store.problems`, `sense.nonsense`). Deep: the cached units too, their keys computed anew, what arrays say of
-themselves, and what only all demos together can tell, such as a geometry that two splits share.
+hold of it (`store.problems`, `sense.nonsense`), and all bodies against each other, for a geometry that two splits share.
+Deep: the cached units too, what shards hold against them, their keys computed anew, and what arrays say of themselves.
 
 Nothing that is read is trusted: files are compared with their hashes before anything is decoded, and whatever is wrong
 becomes a line of the report, never a traceback.
@@ -19,7 +19,7 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from hashlib import sha256
 from heapq import merge
-from itertools import chain
+from itertools import chain, zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -99,9 +99,8 @@ class _Seen:
     rejects: dict[str, Counter[str]] = field(default_factory=dict)
     arrays: dict[str, list[str]] = field(default_factory=dict)  # paths of those that a stage makes
     upstream: dict[str, dict[int, str]] = field(default_factory=dict)  # of each stage's latest unit: digest by demo
-    parts: array[int] = field(default_factory=lambda: array("B"))  # of each demo of the shards, where it is in PARTS
-    geometry: dict[str, tuple[array[int], array[int]]] = field(  # of each body that was seen: digest, and split
-        default_factory=lambda: {body: (array("Q"), array("B")) for body in GEOMETRY}
+    geometry: dict[str, tuple[array[int], array[int]]] = field(  # of each body: digest, and which demo of the shards' it is of
+        default_factory=lambda: {body: (array("Q"), array("Q")) for body in GEOMETRY}
     )
 
 
@@ -244,7 +243,7 @@ def _one_unit(
     for what, reasons in record.get("rejects", {}).items():
         seen.rejects.setdefault(what, Counter()).update(reasons)
     if is_shard:
-        index.see(entry.path, record, seen)
+        index.see(entry.path, record)
     else:
         seen.arrays[stage], seen.upstream[stage] = store.array_paths(record), {}
     if deep:
@@ -279,12 +278,13 @@ def _decoded(root: Path, entry: UnitEntry, record: Record, stage: str | None, se
         sample = block.sample(number)
         found = [*_as_written(sample, row), *store.problems(sample)]
         if stage is None:
-            found += [*_as_told(sample, row), *sense.nonsense(sample), *_as_upstream(sample, row["demo"], seen)]
-            for (body, paths), meshes in zip(GEOMETRY.items(), meshes_in(sample)):
-                if len(sample[paths[0]]) and seen.demos < len(seen.parts):
-                    digests, parts = seen.geometry[body]
+            found += [*_as_told(sample, row), *_as_upstream(sample, row["demo"], seen)]
+            found += () if found else sense.nonsense(sample)
+            for (body, paths), meshes in () if found else zip(GEOMETRY.items(), meshes_in(sample)):
+                if len(sample[paths[0]]):
+                    digests, demos = seen.geometry[body]
                     digests.append(_geometry(sample, paths, meshes))
-                    parts.append(seen.parts[seen.demos])
+                    demos.append(seen.demos)
             seen.demos += 1
         else:
             seen.upstream[stage][row["demo"]] = row["sha256"]
@@ -332,7 +332,8 @@ def _lists(root: Path, found: Manifest) -> Iterator[str]:
     shard_stage = _shard_stage(found)
     made = found.stages[shard_stage].units if shard_stage else []
     made = made if any(entry.demos for entry in made) else []  # units without a demo, each rejected, are no shards
-    if list(found.shards) != list(made) or manifest.listed_shards(root) != [_named(entry) for entry in made]:
+    shards = zip_longest(found.shards, made, manifest.listed_shards(root))
+    if any(entry is None or entry != other or _named(entry) != listed for entry, other, listed in shards):
         yield "manifest.json: the shards are not the units of a stage"
     ranges = [(unit.start, unit.stop) for unit in stages.units(found.recipe["demos"], found.recipe["shard_size"])]
     spared = {entry.demo_range for entry in found.missing}
@@ -374,19 +375,19 @@ class _IndexRows:
 
     def __init__(self, root: Path, found: Manifest) -> None:
         self.root, self.found = root, found
-        self._stored, self._wrong, self._error, self._ended = self._stream(), set[str](), "", False
+        self._names, self._stored = list[str](), self._stream()
+        self._wrong, self._error, self._ended = set[str](), "", False
 
-    def _stream(self) -> Iterator[dict[str, Any]]:
+    def _stream(self) -> Iterator[tuple[Any, ...]]:
         try:
             index = manifest.read_index(self.root)
-            names = list(index)
-            for values in index.stream(names):
-                yield dict(zip(names, values))
+            self._names = [name for name in index if name != "split"]
+            yield from index.stream(self._names)
         except CorruptionError as error:
             self._error = str(error)
 
-    def see(self, path: str, record: Record, seen: _Seen) -> None:
-        """Compares the record of the shard that comes next, and notes which split its demos are in."""
+    def see(self, path: str, record: Record) -> None:
+        """Compares the record of the shard that comes next."""
         for number, row in enumerate(record["rows"]):
             stored = next(self._stored, None)
             if stored is None:
@@ -396,29 +397,33 @@ class _IndexRows:
                 told = index_row(self.found.recipe, path, number, row)
             except (KeyError, IndexError, TypeError):  # the record does not say all that it should
                 told = {}
-            part = stored.pop("split")
-            seen.parts.append(PARTS.index(part) if part in PARTS else len(PARTS))
-            self._wrong |= {name for name in told.keys() | stored.keys() if told.get(name) != stored.get(name)}
+            if tuple(map(told.get, self._names)) != stored or len(told) != len(stored):
+                there = dict(zip(self._names, stored))
+                self._wrong |= {name for name in told.keys() | there.keys() if told.get(name) != there.get(name)}
 
     def problems(self, seen: _Seen) -> Iterator[str]:
         """What is claimed and isn't so, once all shards have come by."""
         is_more = next(self._stored, None) is not None
-        if self._error or self._ended or is_more:
-            yield self._error or "index.parquet: its rows are not the demos of the shards"
+        if self._error:
+            yield self._error
             return
+        if self._ended or is_more:
+            yield "index.parquet: its rows are not the demos of the shards"
         yield from (f"index.parquet: column {name} is not what the shards say" for name in sorted(self._wrong))
         index = manifest.read_index(self.root)
         if (np.diff(index.read("demo")) <= 0).any():
             yield "index.parquet: a demo is there twice, or out of order"
-        if len(PARTS) in seen.parts:
-            yield f"index.parquet: a split is none of {', '.join(PARTS)}"
+        codes, words = index.codes("split")
+        if not {*words} <= {*PARTS}:
+            yield f"index.parquet: split: got {min({*words} - {*PARTS})!r:.80}, expected one of {', '.join(PARTS)}"
             return
-        parts = np.array(seen.parts)
+        parts = np.array([PARTS.index(word) for word in words], np.uint8)[codes]
         yield from _splits(index, self.found, parts)
         for name in INSTANCES:
             yield from _shared(name, index.read(name), parts)
-        for body, (digests, owners) in seen.geometry.items():
-            yield from _shared(f"{body} geometry", np.array(digests), np.array(owners))
+        for body, (digests, demos) in seen.geometry.items():
+            if len(parts) == seen.demos:
+                yield from _shared(f"{body} geometry", np.array(digests), parts[np.array(demos, int)])
 
 
 def _splits(index: Index, found: Manifest, parts: Array) -> Iterator[str]:

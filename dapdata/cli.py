@@ -342,7 +342,7 @@ def verify(
         found = health.verify(folder, quick=quick, deep=deep, progress=advance)
     if reproduce is not None and found.ok:
         with progress("reproduce", "unit") as advance:
-            found = found.with_reproduced(*make_anew(folder, reproduce, workers=_count(workers), progress=advance))
+            found = found.with_reproduced(*make_anew(folder, reproduce, workers=workers, progress=advance))
     show(found.to_dict(), as_json, str(found))
     return 0 if found.ok else 3
 

@@ -43,7 +43,7 @@ PROGRESS = "progress.json"  # what a running or interrupted command works on
 LOG = "log.jsonl"  # when each unit was made, by whom, how long it took: never read by the data's users
 INDEX_NUMBERS = ("demo", "row", "seed", "container_instance", "object_instance")  # columns that reading relies on
 INDEX_WORDS = ("split", "shard", "task", "sha256")
-MAX_UNITS = 1_000_000  # of a stage: more are no dataset of ours
+MAX_UNITS, MAX_STAGES = 1_000_000, 10  # units of a stage, stages: more are no dataset of ours
 OWN_DIGEST = re.compile(rb'"manifest_sha256": "([0-9a-f]{64})"')
 
 
@@ -67,6 +67,8 @@ def _spec(spec: dict[str, Any]) -> dict[str, Any]:
 
 def _acyclic(specs: dict[str, Any]) -> dict[str, Any]:
     """Specs, or entries with specs, that need only each other, and not in a circle."""
+    if len(specs) > MAX_STAGES:
+        raise ValueError(f"{len(specs)} stages, expected at most {MAX_STAGES}")
     needs = {name: getattr(entry, "spec", entry)["needs"] for name, entry in specs.items()}
     unknown = [need for mine in needs.values() for need in mine if need not in needs]
     if unknown:

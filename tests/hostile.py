@@ -183,6 +183,12 @@ def same_rows(count: int) -> Make:
     return lambda root: forge_index(root, lambda rows: rows.extend(rows[:1] * count))
 
 
+def stages_without_end(entry: Any) -> dict[str, Any]:
+    """Thirty stages, each of which needs all before it: 2^30 ways lead from the last to the first."""
+    names = [f"stage {i}" for i in range(30)]
+    return {name: {"spec": {**entry["spec"], "needs": names[:i]}, "units": []} for i, name in enumerate(names)}
+
+
 DATASETS: dict[str, tuple[Make, str]] = {
     "a shard above the dataset": (in_manifest("shards", 0, "path", value="../outside"), "inside of the dataset"),
     "a shard at an absolute path": (in_manifest("shards", 0, "path", value="/etc"), "inside of the dataset"),
@@ -217,6 +223,10 @@ DATASETS: dict[str, tuple[Make, str]] = {
     "a manifest with NaN": (text_of("manifest.json", '{"format": NaN}'), "NaN, expected numbers that are finite"),
     "a manifest of noise": (text_of("manifest.json", bytes(range(256)) * 9), "manifest.json"),
     "stages in a circle": (in_manifest("stages", "demonstrate", "spec", "needs", value=["label"]), "stages"),
+    "stages that need each other without end": (
+        lambda root: forge_manifest(root, lambda tree: tree["stages"].update(stages_without_end(tree["stages"]["observe"]))),
+        "34 stages, expected at most",
+    ),
     "10^12 demos": (in_manifest("recipe", "demos", value=HUGE), "not those of a recipe"),
     "a recipe that is none": (in_manifest("recipe", value={"name": 3}), "recipe"),
     "somebody's picture": (text_of("secret.png", b"x"), "secret.png: not part of the dataset"),

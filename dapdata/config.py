@@ -76,7 +76,13 @@ class RpdiffConfig(SceneConfig):
     meshes: str | None = key(None, "folder of the meshes and slots; null: none, so that nothing can be settled or judged")
     meshes_sha256: str | None = key(None, "of the names and contents of its files")
     table_height: float = key(1.0, "z of the table top in the source; it becomes z = 0", unit="m", ge=-10, le=10)
-    opening: Literal["+x", "-x", "+y", "-y", "+z"] = key("+x", "axis of the container's frame that points out of its opening")
+    opening: Literal["auto", "+x", "-x", "+y", "-y", "+z"] = key(
+        "auto",
+        "axis of the container's frame out of its opening; auto: +x, or +z if the demonstrated goal is reached from there",
+    )
+    hanging: Literal["auto", "yes", "no"] = key(
+        "auto", "whether objects hang, on pegs along which they come; auto: by the name of the container, such as rack or hook"
+    )
     symmetry: Literal["auto", "none", "box", "revolution"] = key(
         "auto", "of the objects; auto: by the shape of the mesh, or without one by the name: books are boxes, cans are round"
     )

@@ -61,6 +61,12 @@ def observe(config: RpdiffConfig, cameras: CamerasConfig, demo: Demo) -> Cloud |
     )
 
 
+def at_pixel_centres(points: Array, raw: Raw, config: RpdiffConfig) -> Array:
+    """(N, 3) the points of one body's cloud where `observe` has them before fusing, in the source's world."""
+    views = _depth_views(points, raw, config)
+    return points if views is None else np.concatenate([found for found, _ in views])
+
+
 def _fused(points: Array, normals: Array | None, raw: Raw, config: RpdiffConfig, voxel: float) -> tuple[Array, Array, Array]:
     """Points (n, 3), normals (n, 3) and views (n,) of one body's cloud, voxelled."""
     from dapdata.observe.fuse import fuse

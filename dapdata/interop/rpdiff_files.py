@@ -48,7 +48,7 @@ REASONS = {  # besides those of a goal that does not hold, and those of a cloud 
     "mesh_missing": "--meshes has no such mesh, or only a link that leads out of it",
     "mesh_broken": "a mesh or a slot file that is damaged, has no area, numbers that are not finite, or is not in metres",
     "mesh_too_large": "a mesh of more than 200000 faces or 50 MB",
-    "mesh_and_cloud_differ": "the cloud is further than 1 cm from the mesh in the median: another mesh, or other units",
+    "mesh_and_cloud_differ": "the cloud is more than 1 cm off the mesh in the median, and at no scale on it",
     "object_not_convex": "the object's mesh is not convex, and has no convex decomposition beside it",
     "bad_arrays": "arrays that dapdata exported and that are not what it writes",
 }
@@ -232,7 +232,7 @@ class Raw:
     names: Bodies  # C and 1 instance names
     mesh_files: Bodies  # C and 1 paths, as on the machine that made them
     convex_file: str  # of the object's convex decomposition
-    child_class: str
+    classes: Bodies  # words for what they are, such as syn_book
 
 
 def on_table(T_world: Array, config: RpdiffConfig) -> Array:
@@ -338,8 +338,16 @@ def check(found: Fields, table_height: float) -> Raw:
         names=names,
         mesh_files=files,
         convex_file=convex.child[0],
-        child_class=str(_both(found, "multi_obj_names").child) if found.get("multi_obj_names") is not None else "",
+        classes=_classes(found),
     )
+
+
+def _classes(found: Fields) -> Bodies:
+    """What container and object are called; nothing where the file does not tell."""
+    if found.get("multi_obj_names") is None:
+        return Bodies("", "")
+    both = _both(found, "multi_obj_names")
+    return Bodies(*(name if isinstance(name, str) else "" for name in (both.parent, both.child)))
 
 
 def _both(found: Fields, key: str) -> Bodies:

@@ -10,6 +10,7 @@ Symmetry kinds (`records.SYMMETRIES`), each a group acting on the object frame f
 
 from __future__ import annotations
 
+from math import cos, hypot, sin
 from typing import Any
 
 import numpy as np
@@ -20,10 +21,10 @@ Array = NDArray[Any]
 
 def pose(rotation: Array | None = None, translation: Array | tuple[float, float, float] = (0, 0, 0)) -> Array:
     """(4, 4) pose of a (3, 3) rotation (default: none) and a (3,) translation, m."""
-    T = np.eye(4)
-    if rotation is not None:
-        T[:3, :3] = rotation
+    T = np.zeros((4, 4))
+    T[:3, :3] = np.eye(3) if rotation is None else rotation
     T[:3, 3] = translation
+    T[3, 3] = 1
     return T
 
 
@@ -56,8 +57,16 @@ def rotation_about(axis: Array | tuple[float, float, float], angle: float) -> Ar
 
 def rotation_by(turn: Array) -> Array:
     """(3, 3) rotation by a rotation vector (3,): about its direction, by its length in rad; zero turns nothing."""
-    angle = float(np.linalg.norm(turn))
-    return rotation_about(turn, angle) if angle > 0 else np.eye(3)
+    x, y, z = (float(value) for value in turn)
+    angle = hypot(x, y, z)
+    s, c = (sin(angle) / angle, (1 - cos(angle)) / angle**2) if angle > 0 else (1.0, 0.5)
+    return np.array(
+        [
+            [1 - c * (y * y + z * z), c * x * y - s * z, c * x * z + s * y],
+            [c * x * y + s * z, 1 - c * (x * x + z * z), c * y * z - s * x],
+            [c * x * z - s * y, c * y * z + s * x, 1 - c * (x * x + y * y)],
+        ]
+    )
 
 
 def random_rotation(rng: np.random.Generator) -> Array:

@@ -114,7 +114,7 @@ def _look(
     from dapdata.observe.fuse import fuse, view_cloud
     from dapdata.observe.noise import add_noise
     from dapdata.observe.raycast import cast
-    from dapdata.poses import inverse, rotate, transform
+    from dapdata.poses import inverse
 
     clouds = []
     for view in views:
@@ -125,8 +125,4 @@ def _look(
     T_world_camera = np.stack([view.T_world_camera for view in views])
     if cameras.align and len(views) > 1:
         T_world_camera = align(views, points, normals)
-        for v, view in enumerate(views):
-            T_aligned_world = T_world_camera[v] @ inverse(view.T_world_camera)
-            points[v] = transform(T_aligned_world, points[v]).astype(np.float32)
-            normals[v] = rotate(T_aligned_world, normals[v]).astype(np.float32)
-    return fuse(points, normals, voxel), T_world_camera
+    return fuse(points, normals, T_world_camera, voxel), T_world_camera

@@ -8,17 +8,17 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import Field, dataclass
 from typing import Any
 
 import numpy as np
 
-from dapdata.records import Array, columns, is_ragged
+from dapdata.records import RECORDS, Array, Meshes, columns, is_ragged
 from dapdata.split import SPLITS, UNUSED, distinct
 
 LICENSE = "cc0-1.0"  # synthetic geometry, nobody's work: the data may be used for anything
 LICENSE_URL = "https://creativecommons.org/publicdomain/zero/1.0/"
-TAGS = ("dapdata", "synthetic", "point-cloud", "object-placement", "superpoints", "affordance")
+TAGS = ("dapdata", "point-cloud", "object-placement", "superpoints", "affordance")
 SIZES = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"), (1_000_000, "100K<n<1M"))
 COUNTS = ("goals", "container_points", "object_points", "superpoints", "positives", "correspondences")
 
@@ -64,9 +64,7 @@ FRAMES = """## Units and frames
 
 LIMITS = """## Limits
 
-- Everything is synthetic: scenes are drawn from the ranges of a recipe and consist of ideal solids without texture, and
-  depth noise is modelled, not recorded. How far a method trained on it carries over to real scans is not shown by the
-  data itself.
+- {}
 - Containers and what stands in them do not move; there is one object, and no gripper or arm.
 - The labels belong to the demonstrated goal, which is one of several; the others are in `goals/`.
 """
@@ -78,6 +76,80 @@ DAP = """@article{chang2024dap,
   journal = {arXiv preprint arXiv:2409.00499},
   year    = {2024}
 }"""
+
+
+@dataclass(frozen=True)
+class Origin:
+    """What is told of how the demos came about."""
+
+    made: str  # after "Demonstrations of placing an object into a container"
+    holds: str  # what each of them has, besides its labels
+    does: Mapping[str, str]  # what a stage did; stages of other names are listed without a word
+    limits: str
+    needs: str  # what it takes to make them again, besides the recipe
+    license: str  # as the hub calls it
+    license_url: str  # "" where nobody here knows it
+    licence: str  # a sentence
+    tags: tuple[str, ...]
+    collection: tuple[str, str, str]  # Croissant's: how, of what type, what may be personal in it
+
+
+DRAWN = Origin(
+    made="made in simulation",
+    holds="noisy point clouds of container and object, superpoints, every goal that holds in physics",
+    does={
+        "demonstrate": (
+            "draws a scene, settles the object at every candidate goal, shakes the container and moves the object in"
+        ),
+        "observe": "looks at container and object with noisy depth cameras and fuses what they see",
+    },
+    limits=(
+        "Everything is synthetic: scenes are drawn from the ranges of a recipe and consist of ideal solids without texture,\n"
+        "  and depth noise is modelled, not recorded. How far a method trained on it carries over to real scans is not shown\n"
+        "  by the data itself."
+    ),
+    needs="",
+    license=LICENSE,
+    license_url=LICENSE_URL,
+    licence=f"[{LICENSE}]({LICENSE_URL}): use it for anything.",
+    tags=("synthetic",),
+    collection=(
+        "Drawn from a recipe, settled in a physics simulator, observed by simulated depth cameras.",
+        "Software Collection",
+        "None: nothing in it was recorded.",
+    ),
+)
+
+
+def origin(manifest: Mapping[str, Any]) -> Origin:
+    """What is told of how the demos of a dataset came about: drawn, or imported from the source that its recipe names."""
+    source = manifest["recipe"]["scene"].get("source")
+    if source is None:
+        return DRAWN
+    return Origin(
+        made=f"imported from `{source}`, where others made them,",
+        holds="point clouds of container and object, superpoints, the goals that are known",
+        does={
+            "demonstrate": "reads poses, and settles and checks goals again where there is geometry",
+            "observe": "reads the clouds and fuses them; nothing is added",
+        },
+        limits="What was recorded or simulated, and how, is for the makers of the source to say; nothing is known of it here.",
+        needs=" and the source",
+        license="other",
+        license_url="",
+        licence="That of the source; cite its makers.",
+        tags=("imported",),
+        collection=(
+            "Imported from files that others made.",
+            "Others",
+            "Nothing is known here of what was recorded.",
+        ),
+    )
+
+
+def stored(manifest: Mapping[str, Any]) -> Iterator[Field[Any]]:
+    """The arrays of a dataset's shards: all that every dataset has, and the triangles of one that may have meshes."""
+    return columns(*RECORDS, Meshes) if "meshes" in manifest["recipe"]["scene"] else columns()
 
 
 def render(
@@ -106,10 +178,10 @@ def render(
         _rejects(manifest["rejects"], manifest["missing"]),
         FRAMES,
         f"## Files\n\n{form.files}\n",
-        *([f"## Arrays\n\n{_table(ARRAYS_HEAD, _arrays())}"] if form.has_arrays else []),
+        *([f"## Arrays\n\n{_table(ARRAYS_HEAD, _arrays(manifest))}"] if form.has_arrays else []),
         _how(manifest, stages),
-        LIMITS,
-        f"## Licence\n\n[{LICENSE}]({LICENSE_URL}): use it for anything.\n",
+        LIMITS.format(origin(manifest).limits),
+        f"## Licence\n\n{origin(manifest).licence}\n",
         f"## Citation\n\n```bibtex\n{citation(manifest)}\n```\n\nThe labels are those of\n\n```bibtex\n{DAP}\n```\n",
     ]
     return "\n".join(part for part in parts if part)
@@ -126,15 +198,16 @@ def summary(manifest: Mapping[str, Any], demos: int, here: int) -> str:
         demos: How many are in the shards.
         here: How many of them are beside the text; 0 before the dataset is labelled.
     """
+    about = origin(manifest)
     what = (
-        f"Demonstrations of placing an object into a container, task `{manifest['task']}`, made in simulation by dapdata "
+        f"Demonstrations of placing an object into a container, task `{manifest['task']}`, {about.made} by dapdata "
         f"{manifest['created_by']['dapdata']}"
     )
     if not here:
         return f"{what}: {manifest['demos']} demos, not yet labelled."
     return (
-        f"{what}: {here if here == demos else f'{here} of {demos}'} demos, each with noisy point clouds of container and "
-        "object, superpoints, every goal that holds in physics, and the affordance and correspondence labels of the "
+        f"{what}: {here if here == demos else f'{here} of {demos}'} demos, each with {about.holds}, "
+        "and the affordance and correspondence labels of the "
         "demonstrated one."
     )
 
@@ -159,7 +232,9 @@ def citation(manifest: Mapping[str, Any]) -> str:
 def _header(manifest: Mapping[str, Any], index: Mapping[str, Array], form: Form) -> str:
     here = _here(index)
     size = next((text for limit, text in SIZES if here < limit), "n>1M")
-    lines = [f"license: {LICENSE}", "task_categories:", "- robotics", "tags:", *(f"- {tag}" for tag in TAGS)]
+    about = origin(manifest)
+    lines = [f"license: {about.license}", "task_categories:", "- robotics", "tags:"]
+    lines += [f"- {tag}" for tag in (*TAGS, *about.tags)]
     lines += [f"pretty_name: {manifest['name']}", "size_categories:", f"- {size}"]
     lines += [form.header] if index and form.header else []
     return "\n".join(["---", *lines, "---"])
@@ -226,9 +301,9 @@ def _rejects(rejects: Mapping[str, Mapping[str, int]], missing: Sequence[Mapping
 ARRAYS_HEAD = ("array", "dtype", "shape", "unit", "frame", "what")
 
 
-def _arrays() -> Iterator[tuple[str, ...]]:
+def _arrays(manifest: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
     """The lines of the table of arrays, from the one that shards are written by."""
-    for column in columns():
+    for column in stored(manifest):
         about = column.metadata
         dims = about["dims"] if is_ragged(column) else about["dims"][1:]
         codes = f" ({', '.join(f'{i} {name}' for i, name in enumerate(about['names']))})" if about["names"] else ""
@@ -243,18 +318,16 @@ def _arrays() -> Iterator[tuple[str, ...]]:
         )
 
 
-DOES = {  # what a stage did; stages of other names are listed without a word
-    "demonstrate": "draws a scene, settles the object at every candidate goal, shakes the container and moves the object in",
-    "observe": "looks at container and object with noisy depth cameras and fuses what they see",
+DOES = {  # as Origin.does, wherever the demos are from
     "cluster": "partitions the clouds into superpoints",
     "label": "computes affordance and correspondence of the demonstrated goal",
 }
 
 
 def _how(manifest: Mapping[str, Any], stages: Mapping[str, Mapping[str, Any]]) -> str:
-    recipe, lines = manifest["recipe"], []
+    recipe, lines, words = manifest["recipe"], [], {**DOES, **origin(manifest).does}
     for name, spec in stages.items():
-        does = f" {DOES[name]}" if name in DOES else ""
+        does = f" {words[name]}" if name in words else ""
         versions = ", ".join(f"{package} {number}" for package, number in sorted(spec["packages"].items()))
         lines.append(f"- `{name}`{does} (version {spec['version']}; {versions}; recipe: {', '.join(sorted(spec['sections']))})")
     made = "\n".join(lines)
@@ -263,7 +336,7 @@ def _how(manifest: Mapping[str, Any], stages: Mapping[str, Mapping[str, Any]]) -
 {made}
 
 Seed {recipe["seed"]}. The recipe below, saved as a file and given to `dapdata generate` and then `dapdata label`, makes the
-same arrays again with the versions above; their digest is `{manifest["content_sha256"]}`.
+same arrays again with the versions above{origin(manifest).needs}; their digest is `{manifest["content_sha256"]}`.
 
 <details><summary>The recipe, every default filled in</summary>
 

@@ -13,6 +13,7 @@ import os
 import shutil
 import signal
 import sys
+from collections import Counter
 from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
@@ -36,6 +37,7 @@ from dapdata.console import (
 from dapdata.errors import DapdataError, UsageError, require
 
 CLICK_ERROR: type[Exception] = typer.BadParameter.__mro__[2]  # ClickException, of all bad arguments; not exported
+TOLD = 10  # rejected demos of an import that are told one by one
 STOPPED, INTERRUPTED = "stopped; the same command, run again, goes on where it stopped", 130
 
 Net = Literal["both", "affordance", "pose"]
@@ -595,6 +597,8 @@ def run(
 
 # Other formats ---------------------------------------------------------------------------------------------
 
+imports = typer.Typer(no_args_is_help=True, rich_markup_mode=None, epilog="Example: dapdata import rpdiff DEMOS --meshes DIR")
+app.add_typer(imports, name="import", help="Make a dataset of demos in the format of other tools.")
 exports = typer.Typer(no_args_is_help=True, rich_markup_mode=None, epilog="Example: dapdata export parquet DATASET --out DIR")
 app.add_typer(exports, name="export", help="Write a dataset in the format of other tools.")
 
@@ -602,6 +606,55 @@ Target = Annotated[Path, _option("--out", help="Folder to write; must be new or 
 OneSplit = Annotated[Split | None, _option("--split", help="Only this split", default="all, each in files of its own")]
 AtMost = Annotated[int | None, _option("--demos", help="Only so many demos, the first ones", default="all", min=1, metavar="N")]
 InFile = Annotated[int | None, _option("--shard-size", help="Demos in a file", default="the format's", min=1, metavar="N")]
+
+
+@imports.command("rpdiff", epilog="Example: dapdata import rpdiff book_chunked --meshes descriptions/objects --out data/books")
+def import_rpdiff(
+    source: Annotated[Path, typer.Argument(help="demo_aug_*.npz, single or in chunks: a file, or a folder with all below it.")],
+    out: Out = None,
+    meshes: Annotated[
+        Path | None,
+        _option(
+            "--meshes", help="Folder with the meshes and slot files", default="none: goals stay as commanded", metavar="DIR"
+        ),
+    ] = None,
+    demos: Demos = None,
+    workers: Workers = None,
+    engine: Engine = "local",
+    memory: Memory = None,
+    allow_missing: AllowMissing = False,
+    overrides: Overrides = None,
+    dry_run: DryRun = False,
+    fresh: Fresh = False,
+    as_json: Json = False,
+) -> None:
+    """Demos of RPDiff, or in its layout (AnyPlace). Goals are settled and checked again. Goes on where it stopped."""
+    from dapdata.imports import rpdiff_recipe
+
+    asked = rpdiff_recipe(source, meshes, demos, overrides or ())
+    means = {"workers": workers, "engine": engine, "memory": memory, "allow_missing": allow_missing, "fresh": fresh}
+    _import(asked, out, dry_run, as_json, **means)
+
+
+def _import(asked: Any, out: str | None, dry_run: bool, as_json: bool, **means: Any) -> None:
+    """Runs a recipe that imports, and says how many demos came in."""
+    from dapdata import health
+    from dapdata.imports import run
+
+    with progress("import", "demo") as advance:
+        made = run(asked, out, dry_run=dry_run, progress=None if dry_run else advance, **means)
+    if not isinstance(made, str | Path):
+        show(made.to_dict(), as_json, str(made))
+        return
+    rejected = health.rejected(made)
+    for told in rejected[:TOLD]:
+        say(f"rejected demo {told['demo']}, {told['reason']}: {told['detail']}")
+    if len(rejected) > TOLD:
+        say(f"rejected {len(rejected) - TOLD} more; --json tells all")
+    counts = "".join(f", {count} {reason}" for reason, count in Counter(told["reason"] for told in rejected).items())
+    say(f"imported {asked.demos - len(rejected)} of {asked.demos} demos{counts}; next: dapdata label {made}")
+    remember(dataset=made)
+    show({"dataset": str(made), "demos": asked.demos, "rejected": rejected}, as_json, str(made))
 
 
 @exports.command("webdataset", epilog="Example: dapdata export webdataset data/can_cabinet --out tars --shard-size 200")
@@ -653,6 +706,19 @@ def export_scenes(
 ) -> None:
     """GLB and URDF of the true scenes. Container and clutter, the object, every goal as a frame."""
     _export("scenes", dataset, out, as_json, split=split, demos=demos)
+
+
+@exports.command("rpdiff", epilog="Example: dapdata export rpdiff data/can_cabinet --out rpdiff/can_cabinet_chunked")
+def export_rpdiff(
+    out: Target,
+    dataset: LastDataset = None,
+    split: OneSplit = None,
+    demos: AtMost = None,
+    shard_size: InFile = None,
+    as_json: Json = False,
+) -> None:
+    """Chunks that RPDiff's own loader reads. With split lists and meshes; 9 demos in a file."""
+    _export("rpdiff", dataset, out, as_json, split=split, demos=demos, shard_size=shard_size)
 
 
 def _export(kind: str, dataset: str | None, out: Path, as_json: bool, **options: Any) -> None:

@@ -6,7 +6,7 @@ range and a sentence. Each stage's section stands above the stage that uses it; 
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal, TypeVar, get_args
+from typing import Annotated, Any, ClassVar, Literal, TypeVar, get_args
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, field_validator, model_validator
 
@@ -20,6 +20,8 @@ class Section(BaseModel):
 class SceneConfig(Section):
     """Base of a task's parameters: `class Params(SceneConfig)` with `task: Literal["<module name>"]`."""
 
+    stages: ClassVar[str] = "dapdata.pipeline"  # module that holds STAGES, what makes a dataset of such scenes
+    remedy: ClassVar[str] = "change cameras, noise or superpoints in the recipe"  # when all demos are rejected
     task: str = Field(description="name of a task, see `dapdata init`")
 
 
@@ -63,6 +65,32 @@ PositiveCountRange = Annotated[tuple[_PositiveCount, _PositiveCount], BeforeVali
 DegreesRange = Annotated[tuple[_Degrees, _Degrees], BeforeValidator(_pair), AfterValidator(_ordered)]
 
 
+class RpdiffConfig(SceneConfig):
+    """Demos in RPDiff's layout, that are read instead of drawn."""
+
+    stages: ClassVar[str] = "dapdata.imports"
+    remedy: ClassVar[str] = "docs/import_rpdiff.md tells what is behind each reason"
+    task: Literal["rpdiff"] = "rpdiff"
+    source: str = key("", "file or folder of the demos, as it was named when they were imported")
+    source_sha256: str = key("", "of the names, sizes and checksums of all that its files hold; another one is refused")
+    meshes: str | None = key(None, "folder of the meshes and slots; null: none, so that nothing can be settled or judged")
+    meshes_sha256: str | None = key(None, "of the names and contents of its files")
+    table_height: float = key(1.0, "z of the table top in the source; it becomes z = 0", unit="m", ge=-10, le=10)
+    opening: Literal["+x", "-x", "+y", "-y", "+z"] = key("+x", "axis of the container's frame that points out of its opening")
+    symmetry: Literal["auto", "none", "box", "revolution"] = key(
+        "auto", "of the objects; auto: by the shape of the mesh, or without one by the name: books are boxes, cans are round"
+    )
+    max_tilt_deg: float | None = key(
+        None, "largest angle from upright that counts as placed; null: 15, or any for objects without symmetry", ge=0, le=180
+    )
+    drop_seconds: float = key(
+        1.5, "physics after which a commanded pose or a slot is a candidate, as in the source", unit="s", ge=0.1, le=10
+    )
+    half_pixel: bool = key(
+        True, "clouds that were projected from the corners of their pixels are moved to the centres; off: left as they are"
+    )
+
+
 class SplitConfig(Section):
     """How demos are shared out; by container and object instance, so that no instance is in two splits."""
 
@@ -95,7 +123,7 @@ PAPER: dict[str, Any] = {
 AT_INFERENCE = ("sample_steps", "crop_margin", "cap_crop", "refine", "hover", "ranking")
 
 # STEPS and CRITERIA of daptrain.refine, which must not be imported here; a test compares them.
-Step = Literal["gravity", "yaw", "settle", "search"]
+Step = Literal["gravity", "yaw", "settle", "search", "spread"]
 Criterion = Literal["inside", "path", "support", "balance", "residual"]
 
 

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from dapdata import card, durable
-from dapdata.records import columns, is_ragged
+from dapdata.records import is_ragged
 from dapdata.tables import Index
 
 CONTEXT = {
@@ -81,23 +81,25 @@ def render(manifest: Mapping[str, Any], folders: Sequence[str], index: Index) ->
         folders: Where the shards are.
         index: Of all demos; its columns are not read.
     """
+    about = card.origin(manifest)
+    how, of_type, personal = about.collection
     tree = {
         "@context": CONTEXT,
         "@type": "sc:Dataset",
         "conformsTo": "http://mlcommons.org/croissant/1.0",
         "name": manifest["name"],
         "description": card.summary(manifest, index.rows, index.rows),
-        "license": card.LICENSE_URL,
+        **({"license": about.license_url} if about.license_url else {}),
         "citeAs": card.citation(manifest),
         "creator": {"@type": "sc:Organization", "name": "dapdata"},
-        "keywords": [*card.TAGS, manifest["task"]],
+        "keywords": [*card.TAGS, *about.tags, manifest["task"]],
         "version": f"{manifest['format']}.0.0+{manifest['content_sha256'][:12]}",
-        "rai:dataCollection": "Drawn from a recipe, settled in a physics simulator, observed by simulated depth cameras.",
-        "rai:dataCollectionType": "Software Collection",
-        "rai:dataLimitation": "Ideal solids without texture; modelled depth noise; one object; containers do not move.",
-        "rai:personalSensitiveInformation": "None: nothing in it was recorded.",
+        "rai:dataCollection": how,
+        "rai:dataCollectionType": of_type,
+        "rai:dataLimitation": " ".join(about.limits.split()) + " One object; containers do not move.",
+        "rai:personalSensitiveInformation": personal,
         "distribution": _distribution(folders, index.path),
-        "recordSet": [_demos(index), _arrays()],
+        "recordSet": [_demos(index), _arrays(manifest)],
     }
     return json.dumps(tree, indent=1, ensure_ascii=False).encode() + b"\n"
 
@@ -141,11 +143,11 @@ def _demos(index: Index) -> dict[str, Any]:
     return {"@type": "cr:RecordSet", "@id": "demos", "name": "demos", "key": {"@id": "demos/demo"}, "field": fields}
 
 
-def _arrays() -> dict[str, Any]:
+def _arrays(manifest: Mapping[str, Any]) -> dict[str, Any]:
     """The table of arrays as a record set whose records stand in the description itself."""
     fields = [{"@type": "cr:Field", "@id": f"arrays/{name}", "name": name, "dataType": "sc:Text"} for name in ABOUT_ARRAYS]
     records = []
-    for column in columns():
+    for column in card.stored(manifest):
         about = column.metadata
         dims = about["dims"] if is_ragged(column) else about["dims"][1:]
         shape, codes = " x ".join(map(str, dims)), ", ".join(f"{i} {name}" for i, name in enumerate(about["names"]))

@@ -18,12 +18,14 @@ Source: C. Boucheny, "Interactive scientific visualization of large datasets" (2
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from dapdata.records import Mesh
 from dapdata.solids import to_trimesh
 
 Array = NDArray[Any]
@@ -104,7 +106,7 @@ def blank(camera: Camera) -> Canvas:
 def draw_cloud(
     canvas: Canvas,
     points: Array,
-    colors: Array,
+    colors: ArrayLike,
     normals: Array | None = None,
     radius: float = POINT_RADIUS,
     light: float = 0.35,
@@ -213,7 +215,7 @@ class Triangles:
         return Triangles(vertices.reshape(-1, 3), faces.reshape(-1, 3), (self.part + step * parts).ravel())
 
 
-def triangulate(kind: Array, size: Array, T: Array, *, sections: int = 64) -> Triangles:
+def triangulate(kind: Array, size: Array, T: Array, sections: int = 64, meshes: Sequence[Mesh | None] = ()) -> Triangles:
     """The triangles of P parts: the one place where pictures and 3-D views learn what a part looks like.
 
     Args:
@@ -221,13 +223,15 @@ def triangulate(kind: Array, size: Array, T: Array, *, sections: int = 64) -> Tr
         size: (P, 3) full extents, m.
         T: (P, 4, 4) in the frame that the triangles shall be in.
         sections: Sides of a cylinder.
+        meshes: P, the triangles of the parts that are meshes; may be left out where there are none.
     """
-    meshes = [to_trimesh(kind[p : p + 1], size[p : p + 1], T[p : p + 1], sections) for p in range(len(kind))]
-    first = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
+    one = (slice(p, p + 1) for p in range(len(kind)))
+    solids = [to_trimesh(kind[p], size[p], T[p], sections, meshes[p]) for p in one]
+    first = np.cumsum([0, *(len(solid.vertices) for solid in solids)])
     return Triangles(
-        np.concatenate([np.zeros((0, 3)), *(mesh.vertices for mesh in meshes)]),
-        np.concatenate([np.zeros((0, 3), int), *(mesh.faces + start for mesh, start in zip(meshes, first))]),
-        np.repeat(np.arange(len(meshes)), [len(mesh.faces) for mesh in meshes]),
+        np.concatenate([np.zeros((0, 3)), *(solid.vertices for solid in solids)]),
+        np.concatenate([np.zeros((0, 3), int), *(solid.faces + start for solid, start in zip(solids, first))]),
+        np.repeat(np.arange(len(solids)), [len(solid.faces) for solid in solids]),
     )
 
 

@@ -341,6 +341,17 @@ def _in_progress(root: Path) -> dict[str, Any] | None:
     return {"demos": demos, "units": len(todo), "done": done}
 
 
+@remote.on_copy(units=True)
+def rejected(root: str | Path) -> list[dict[str, Any]]:
+    """Which demos were left out, in their order: "demo", "stage", "reason", and "detail" for who looks after it."""
+    root = Path(root)
+    found = []
+    for name, stage in manifest.read(root).stages.items():
+        for unit in stage.units:
+            found += [{"stage": name, **told} for told in store.read_record(root / unit.path).get("rejected", ())]
+    return sorted(found, key=lambda told: int(told["demo"]))
+
+
 @remote.on_copy(files=remote.TABLES)
 def inspect(root: str | Path) -> Facts:
     """What is inside: counts, statistics a demo, rejects by reason, sizes."""

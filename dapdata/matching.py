@@ -7,13 +7,14 @@ to choose. Definitions in docs/metrics.md.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from math import comb, log
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dapdata.records import GOAL_KINDS, PART_KINDS
+from dapdata.records import GOAL_KINDS, PART_KINDS, Mesh
 
 Array = NDArray[Any]
 
@@ -24,25 +25,31 @@ HALF_TURNS = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]], float)
 # Distances modulo symmetry ---------------------------------------------------------------------------------
 
 
-def hull_points(kind: Array, size: Array, T_object_part: Array) -> Array:
+def hull_points(kind: Array, size: Array, T_object_part: Array, meshes: Sequence[Mesh | None] = ()) -> Array:
     """Points of an object's surface among which the one that moves most is found, whatever the motion.
 
     Args:
         kind: (Q,) index into records.PART_KINDS.
         size: (Q, 3) full extents, m.
         T_object_part: (Q, 4, 4).
+        meshes: Q, the triangles of the parts that are meshes; may be left out where there are none.
 
     Returns:
-        (X, 3) object frame, m: corners of boxes, 16 points on both rims of cylinders, the corners of the cuboid
-        around anything else (which overstates its distances a little).
+        (X, 3) object frame, m: corners of boxes, 16 points on both rims of cylinders, the corners of the convex hulls of
+        meshes, those of the cuboid around anything else (which overstates its distances a little).
     """
     corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
     turn = np.arange(16) * np.pi / 8
     ring = np.stack([np.cos(turn) / 2, np.sin(turn) / 2], axis=1)
     rims = np.concatenate([np.column_stack([ring, np.full(16, end)]) for end in (-0.5, 0.5)])
-    points = []
-    for k, extents, T in zip(kind, size, T_object_part):
-        local = (rims if PART_KINDS[int(k)] == "cylinder" else corners) * extents
+    points = [np.zeros((0, 3))]
+    for k, extents, T, mesh in zip(kind, size, T_object_part, meshes or [None] * len(kind)):
+        if mesh is not None:
+            from scipy.spatial import ConvexHull
+
+            local = mesh.vertices[ConvexHull(mesh.vertices).vertices]
+        else:
+            local = (rims if PART_KINDS[int(k)] == "cylinder" else corners) * extents
         points.append(local @ T[:3, :3].T + T[:3, 3])
     return np.concatenate(points)
 

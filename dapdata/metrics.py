@@ -40,7 +40,7 @@ from dapdata.matching import (
 )
 from dapdata.poses import symmetric_distance
 from dapdata.predictions import Predictions, collect, read
-from dapdata.records import SYMMETRIES, Demo, Placement, Verdict, read_record
+from dapdata.records import SYMMETRIES, Demo, Placement, Verdict, meshes_of, read_demo
 from dapdata.report import (
     Affordance,
     Cost,
@@ -167,7 +167,7 @@ def judge_scene(
     verdicts = list(simulate.judge(demo, judged, placement, protocol)) if len(judged) else []
     seconds = time.perf_counter() - start
     symmetry, axis = SYMMETRIES[int(demo.symmetry_kind)], np.asarray(demo.symmetry_axis, float)
-    points = hull_points(demo.object_kind, demo.object_size, demo.T_object_part)
+    points = hull_points(demo.object_kind, demo.object_size, demo.T_object_part, meshes_of(demo)[1])
     distance = surface_distance(T_world_object, demo.goals, points, symmetry, axis)
     nearest = [symmetric_distance(T, demo.goals[g], symmetry, axis) for T, g in zip(T_world_object, distance.argmin(axis=1))]
     return SceneResult(
@@ -206,7 +206,7 @@ def judge_all(
         workers: Processes.
         progress: Called once a scene.
     """
-    demos = [read_record(Demo, dict(sample)) for sample in samples]
+    demos = [read_demo(sample) for sample in samples]
     jobs = [(demo, predictions.of(int(demo.demo)), predictions.ranks(int(demo.demo)), k, placement, protocol) for demo in demos]
     results = []
     for result in _run(jobs, workers):

@@ -22,6 +22,7 @@ from dapdata.draw import (
     Canvas,
     Triangles,
     blank,
+    draw_cloud,
     draw_ground,
     draw_solids,
     frame,
@@ -32,7 +33,7 @@ from dapdata.draw import (
     triangulate,
 )
 from dapdata.matching import hull_points
-from dapdata.poses import facing, transform
+from dapdata.poses import facing, inverse, rotate, transform
 
 Array = NDArray[Any]
 Sample = Mapping[str, Array]
@@ -43,6 +44,7 @@ GUTTER, ROW_TITLE, HEADER, FOOTER = 14, 40, 74, 118  # px
 BAR = PANEL[0] - 180  # px, length of a bar of colours
 DPI = 100
 JPEG = 82  # quality of pictures in pages
+OBJECT_RADIUS = 0.6 * POINT_RADIUS  # m: the object's cloud is finer than the container's
 SIDE, ABOVE = 0.42, 0.36  # the viewer stands this far aside and above, per unit in front of the opening
 WOOD, CLUTTER = (0.93, 0.90, 0.85), (0.70, 0.73, 0.79)
 VALID, DEMONSTRATED = (0.00, 0.62, 0.45), (0.96, 0.64, 0.00)
@@ -72,40 +74,61 @@ def front_view(sample: Sample, width: int, height: int) -> Camera:
     """The camera in front of the container, a little aside and above, with the container and its goals in the picture."""
     out = facing(sample["pose/T_world_container"], sample["scene/opening"])
     aside = np.array([out[1], -out[0], 0.0])  # to the viewer's left of the opening's direction
-    corners = hull_points(*(sample[f"object_parts/{name}"] for name in ("kind", "size", "T_object_part")))
-    placed = [transform(T_world_object, corners) for T_world_object in sample["goals/T_world_object"]]
+    placed = [transform(T_world_object, _object_points(sample)) for T_world_object in sample["goals/T_world_object"]]
     return frame(
         np.concatenate([sample["container/points"], *placed]).astype(float), out - SIDE * aside + [0, 0, ABOVE], width, height
     )
 
 
+def _object_points(sample: Sample) -> Array:
+    """(X, 3) points around the object, its own frame, m: of its parts, or of its cloud where nobody knows them."""
+    if not len(sample["object_parts/kind"]):
+        return transform(inverse(sample["pose/T_world_object_start"]), sample["object/points"].astype(float))
+    parts = (sample[f"object_parts/{name}"] for name in ("kind", "size", "T_object_part"))
+    kind, size, T_object_part = parts
+    return hull_points(kind, size, T_object_part, records.meshes_in(sample)[1])
+
+
 def draw_scene(canvas: Canvas, sample: Sample) -> None:
-    """Adds the true parts of the container and of the clutter, and the table."""
+    """Adds the true parts of the container and of the clutter, and the table; the container's cloud if nobody knows them."""
     parts = solids(sample)
     for role, color in zip(records.ROLES, (WOOD, CLUTTER)):
         draw_solids(canvas, parts[role].at(sample["pose/T_world_container"][None]), color)
+    if not len(sample["scene/kind"]):
+        draw_cloud(canvas, sample["container/points"].astype(float), WOOD, sample["container/normals"].astype(float))
     draw_ground(canvas, sample["pose/T_world_container"][:3, 3], radius=0.6)
 
 
 def solids(sample: Sample, sections: int = 64) -> dict[str, Triangles]:
-    """The true solids of a demo: the object in its own frame, container and clutter in the container's.
+    """The true parts of a demo: the object in its own frame, container and clutter in the container's.
 
     Args:
         sample: One demo's arrays by shard path.
         sections: Sides of a cylinder.
     """
-    scene = [sample[f"scene/{name}"] for name in ("kind", "size", "T_container_part")]
-    object_ = [sample[f"object_parts/{name}"] for name in ("kind", "size", "T_object_part")]
-    of_role = {role: sample["scene/role"] == code for code, role in enumerate(records.ROLES)}
-    found = {role: triangulate(*(array[mine] for array in scene), sections=sections) for role, mine in of_role.items()}
-    return found | {"object": triangulate(*object_, sections=sections)}
+    of_scene, of_object = records.meshes_in(sample)
+    kind, size, T_container_part = (sample[f"scene/{name}"] for name in ("kind", "size", "T_container_part"))
+    found = {}
+    for code, role in enumerate(records.ROLES):
+        mine = np.flatnonzero(sample["scene/role"] == code)
+        found[role] = triangulate(kind[mine], size[mine], T_container_part[mine], sections, [of_scene[p] for p in mine])
+    kind, size, T_object_part = (sample[f"object_parts/{name}"] for name in ("kind", "size", "T_object_part"))
+    return found | {"object": triangulate(kind, size, T_object_part, sections, of_object)}
 
 
 def draw_goals(
     canvas: Canvas, sample: Sample, T_world_object: Array, color: tuple[float, float, float], opacity: float, hidden: float
 ) -> None:
-    """Adds the object's solids at (G, 4, 4) poses; `opacity` and `hidden` as in `draw_solids`."""
-    draw_solids(canvas, solids(sample)["object"].at(T_world_object), color, opacity, hidden)
+    """Adds the object's solids at (G, 4, 4) poses; `opacity` and `hidden` as in `draw_solids`.
+
+    Where nobody knows its parts, its cloud as observed before placing stands for them.
+    """
+    if len(sample["object_parts/kind"]):
+        draw_solids(canvas, solids(sample)["object"].at(T_world_object), color, opacity, hidden)
+        return
+    for T in T_world_object @ inverse(sample["pose/T_world_object_start"]):
+        points = transform(T, sample["object/points"].astype(float))
+        draw_cloud(canvas, points, color, rotate(T, sample["object/normals"].astype(float)), OBJECT_RADIUS)
 
 
 def is_demonstrated(sample: Sample) -> Array:
@@ -205,7 +228,7 @@ def goal_picture(sample: Sample, camera: Camera) -> Array:
 def _object_pictures(sample: Sample, side: int) -> dict[str, Array]:
     """The object's cloud at its start pose, by height within it and by superpoint."""
     points, normals = sample["object/points"].astype(float), sample["object/normals"].astype(float)
-    radius = 0.6 * POINT_RADIUS  # the object's cloud is finer than the container's
+    radius = OBJECT_RADIUS
     camera = frame(np.r_[points - radius, points + radius], (1, -0.6, 1.0), side, side)  # from above: below is not seen
     seen = splat(blank(camera).camera, points, normals, radius)
     low, span = points[:, 2].min(), max(float(np.ptp(points[:, 2])), 1e-6)

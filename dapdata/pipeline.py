@@ -104,7 +104,7 @@ def generate(
     fresh: bool = False,
     dry_run: bool = False,
     progress: Progress | None = None,
-    table: str = __name__,
+    table: str | None = None,
 ) -> Place | Plan:
     """Makes scenes, settled demonstrations and point clouds; goes on where an earlier call stopped.
 
@@ -119,7 +119,7 @@ def generate(
         fresh: Whether to delete what is there first.
         dry_run: Whether only to say what would run, and why.
         progress: Called with demos done and demos in all whenever a unit is done.
-        table: Module with STAGES and parse; tests put toys here.
+        table: Module with STAGES and parse; default: the one for such scenes. Tests put toys here.
 
     Returns:
         The dataset's folder or URL, or the Plan.
@@ -132,6 +132,7 @@ def generate(
             "--fresh: would delete what other tasks make, expected none with --units; delete the folder before them"
         )
     given = recipe_or_path if not isinstance(recipe_or_path, (str, Path)) else recipe.load(recipe_or_path)
+    table = table or given.scene.stages
     place, stages = remote.locate(out or Path("data") / given.name), import_module(table).STAGES
     resolved = recipe.resolve(given)
     with remote.working_copy(place, units=True) as root:
@@ -151,7 +152,7 @@ def label(
     allow_missing: bool = False,
     dry_run: bool = False,
     progress: Progress | None = None,
-    table: str = __name__,
+    table: str | None = None,
 ) -> Place | Plan:
     """Makes superpoints, affordance and correspondence of a generated dataset, and its shards. Never simulates.
 
@@ -163,11 +164,12 @@ def label(
     Raises:
         UsageError: for an override of what earlier stages read.
     """
-    place, stages = remote.locate(dataset), import_module(table).STAGES
+    place = remote.locate(dataset)
     with remote.working_copy(place, units=True) as root:
         found = manifest.read(root)
-        given = import_module(table).parse(found.recipe, overrides, str(root / manifest.MANIFEST))
-        resolved = recipe.resolve(given)
+        given = recipe.from_resolved(found.recipe, overrides, str(root / manifest.MANIFEST))
+        table = table or given.scene.stages
+        stages, resolved = import_module(table).STAGES, recipe.resolve(given)
         made = {name: entry.spec for name, entry in found.stages.items() if name in GENERATE and entry.units}
         if made.keys() != set(GENERATE):
             raise FormatError(f"{root}: stages {sorted(made)}, expected {', '.join(GENERATE)}; run `dapdata generate` first")
@@ -414,7 +416,7 @@ class _Command:
             reasons = ", ".join(f"{reason} {count}" for reason, count in now.rejects.demos.items())
             raise UsageError(
                 f"{self.root}: all {tried} demos were rejected ({reasons}), expected some that are not; "
-                "change cameras, noise or superpoints in the recipe"
+                f"{self.recipe.scene.remedy}"
             )
 
 

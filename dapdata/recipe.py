@@ -18,13 +18,14 @@ from pydantic import BaseModel, Field, SerializeAsAny, ValidationError, create_m
 
 from dapdata import keys, tasks
 from dapdata.cluster import SuperpointsConfig
-from dapdata.config import PAPER, EvalConfig, SceneConfig, Section, SplitConfig, TrainConfig, key
+from dapdata.config import PAPER, EvalConfig, RpdiffConfig, SceneConfig, Section, SplitConfig, TrainConfig, key
 from dapdata.errors import UsageError, hint
 from dapdata.labels import LabelConfig
 from dapdata.observe import CamerasConfig, NoiseConfig
 from dapdata.simulate import PlacementConfig
 from dapdata.strict_yaml import Location, Source
 
+IMPORTED = {"rpdiff": RpdiffConfig}  # what is read from files, by what takes a task's place
 NAME_PATTERN = r"^[a-z0-9][a-z0-9_-]*$"
 
 
@@ -77,15 +78,15 @@ def from_resolved(resolved: dict[str, Any], overrides: Sequence[str] = (), origi
 
 @cache
 def recipe_class(task: str) -> type[Recipe]:
-    """The Recipe whose scene section is that of the task; the task must be one of `tasks.names()`."""
-    params = tasks.load(task).Params
+    """The Recipe whose scene section is that of the task; the task must be one of `tasks.names()` or `IMPORTED`."""
+    params = IMPORTED[task] if task in IMPORTED else tasks.load(task).Params
     scene = Field(default=params(), description=Recipe.model_fields["scene"].description)
     return create_model("Recipe", __base__=Recipe, __doc__=Recipe.__doc__, scene=(params, scene))
 
 
 def json_schema() -> dict[str, Any]:
     """The JSON Schema of a recipe of any task."""
-    union = reduce(operator.or_, [tasks.load(task).Params for task in tasks.names()])
+    union = reduce(operator.or_, [*(tasks.load(task).Params for task in tasks.names()), *IMPORTED.values()])
     scene = Field(discriminator="task", description=Recipe.model_fields["scene"].description)
     model = create_model("Recipe", __base__=Recipe, __doc__=Recipe.__doc__, scene=(Annotated[union, scene], ...))
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **model.model_json_schema()}
@@ -125,7 +126,7 @@ def _task(source: Source) -> str:
         source.blame(("scene",), f"{got}, expected a section with `task:` {expected.removeprefix('expected ')}")
     elif "task" not in scene:
         source.blame(("scene", "task"), f"missing, {expected}")
-    elif not isinstance(scene["task"], str) or scene["task"] not in known:
+    elif not isinstance(scene["task"], str) or scene["task"] not in (*known, *IMPORTED):
         hint = keys.meant(scene["task"], {"enum": known})
         source.blame(("scene", "task"), f"got {keys.shown(scene['task'])}, {expected}{hint}")
     source.stop_if_wrong()

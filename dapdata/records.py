@@ -11,13 +11,18 @@ from it, and each stage returns one of these records. A field's first dimension 
 Codes (small integers) carry their names in `names`. World frame: right-handed, z up, metres. The object
 frame has its origin at the centre of the object's bounding box and its z axis up at a goal (of a mug,
 which hangs at its goals: up when it stands).
+
+Triangles of parts that are meshes are arrays of the demo like all others (`Meshes`), in imported datasets and in no
+other. Files beside the shards, named by their content, were the alternative: one copy of each mesh
+instead of one a demo. But those of a demo of RPDiff take 3 to 43 kB next to 150 to 600 kB of clouds, and in the shard
+whoever has the demo has the meshes: readers, workers, exports and checks need to know nothing more.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import Field, dataclass, field, fields
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +32,15 @@ Array = NDArray[Any]
 PART_KINDS = ("box", "cylinder", "ellipsoid", "mesh")
 ROLES = ("container", "clutter")
 SYMMETRIES = ("none", "box", "revolution")
-GOAL_KINDS = ("floor", "stack", "gap", "peg", "hole")
+GOAL_KINDS = (
+    "floor",
+    "stack",
+    "gap",
+    "peg",
+    "hole",
+    "settled",  # imported: settled here, and what it rests on is not told
+    "commanded",  # imported: a pose as it was commanded; without meshes, nothing was settled
+)
 REJECT_REASONS = (
     "penetrates",  # overlaps the container or clutter by more than placement.max_penetration
     "unsupported",  # nothing under it
@@ -62,6 +75,7 @@ class Rejected:
     """Why a demo (or an attempt at one) came to nothing: data to be counted, not an error."""
 
     reason: str
+    detail: str = field(default="", compare=False)  # for who looks after it, such as the file or the figure
 
 
 @dataclass(frozen=True)
@@ -69,7 +83,8 @@ class Scene:
     """A container with clutter, an object, and every candidate goal: what a task returns. Not stored as such.
 
     P parts, Q object parts, G candidate goals. Sizes are full extents along the part's own axes: box
-    (x, y, z), cylinder (diameter, diameter, height along z), ellipsoid (three diameters).
+    (x, y, z), cylinder (diameter, diameter, height along z), ellipsoid (three diameters), mesh (a box around it whose
+    centre is the part's origin).
     """
 
     part_kind: Array  # (P,) u1, index into PART_KINDS
@@ -123,7 +138,12 @@ class Demo:
     symmetry_axis: Array = array("symmetry/axis", "<f8", ("demo", 3), "1", "object", "axis of revolution")
     part_kind: Array = array("scene/kind", "|u1", ("part",), "1", "-", "shape of each part", PART_KINDS)
     part_size: Array = array(
-        "scene/size", "<f8", ("part", 3), "m", "part", "full extents: box x y z, cylinder diameter diameter height, ellipsoid"
+        "scene/size",
+        "<f8",
+        ("part", 3),
+        "m",
+        "part",
+        "full extents: box x y z, cylinder diameter diameter height, ellipsoid, mesh: of a box",
     )
     T_container_part: Array = array("scene/T_container_part", "<f8", ("part", 4, 4), "m", "container", "pose of each part")
     part_role: Array = array("scene/role", "|u1", ("part",), "1", "-", "container, or clutter that stands in it", ROLES)
@@ -138,6 +158,29 @@ class Demo:
     object_instance: Array = array("meta/object_instance", "<i8", ("demo",), "1", "-", "digest of the object's geometry")
     attempts: Array = array("meta/attempts", "<i8", ("demo",), "1", "-", "scenes drawn until this one was accepted")
     task: Array = array("meta/task", "|u1", ("demo",), "1", "-", "of a mixture: place in the recipe's scene.scenes")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Meshes:
+    """Triangles of the parts whose kind is mesh. Only datasets that were imported have these arrays."""
+
+    mesh_points: Array = array("mesh_vertices/points", "<f4", ("mesh_vertex", 3), "m", "part", "corners of triangles")
+    mesh_part: Array = array(
+        "mesh_vertices/part", "<i4", ("mesh_vertex",), "1", "-", "its part: rows of scene/, then those of object_parts/"
+    )
+    mesh_faces: Array = array(
+        "mesh_faces/vertices", "<i4", ("mesh_face", 3), "1", "-", "rows of mesh_vertices/, anticlockwise seen from outside"
+    )
+
+
+@dataclass(frozen=True)
+class MeshScene(Scene, Meshes):
+    """A scene with parts that are meshes."""
+
+
+@dataclass(frozen=True)
+class MeshDemo(Demo, Meshes):
+    """A demo with parts that are meshes."""
 
 
 @dataclass(frozen=True)
@@ -214,8 +257,8 @@ Record = Demo | Cloud | Superpoints | Labels
 RECORDS: tuple[type[Record], ...] = (Demo, Cloud, Superpoints, Labels)
 
 
-def columns(*records: type[Record]) -> Iterator[Field[Any]]:
-    """The fields of the given record classes (default: all), that is, the arrays of a shard."""
+def columns(*records: type[Record] | type[Meshes]) -> Iterator[Field[Any]]:
+    """The fields of the given record classes (default: all that every dataset has), that is, the arrays of a shard."""
     for record in records or RECORDS:
         yield from fields(record)
 
@@ -226,19 +269,24 @@ def is_ragged(column: Field[Any]) -> bool:
 
 
 # What the first datasets of format 1 do not hold, by path, from what they do: their objects all come in through the opening.
-LATER: dict[str, Callable[[dict[str, Array]], Array]] = {
+LATER: dict[str, Callable[[Mapping[str, Array]], Array]] = {
     "goals/approach": lambda sample: np.tile(sample["scene/opening"], (len(sample["goals/kind"]), 1)),
     "meta/task": lambda sample: np.zeros((), np.uint8),
 }
 
 
-def read_record(record: type[R], sample: dict[str, Array]) -> R:
+def read_record(record: type[R], sample: Mapping[str, Array]) -> R:
     """A record from one demo's arrays by path (as `dapdata.open(...)[i]` gives them)."""
     return record(**{c.name: _stored_or_later(sample, c.metadata["path"]) for c in fields(record)})
 
 
-def _stored_or_later(sample: dict[str, Array], path: str) -> Array:
+def _stored_or_later(sample: Mapping[str, Array], path: str) -> Array:
     return LATER[path](sample) if path not in sample and path in LATER else sample[path]
+
+
+def read_demo(sample: Mapping[str, Array]) -> Demo:
+    """The Demo of one demo's arrays by path, a MeshDemo if it has meshes."""
+    return read_record(MeshDemo if "mesh_vertices/points" in sample else Demo, sample)
 
 
 def to_sample(*records: Record) -> dict[str, Array]:
@@ -248,6 +296,49 @@ def to_sample(*records: Record) -> dict[str, Array]:
         for record in records
         for c in fields(record)
     }
+
+
+class Mesh(NamedTuple):
+    """A part that is a mesh."""
+
+    vertices: Array  # (V, 3) f8, m, part frame
+    faces: Array  # (F, 3) i8, rows of vertices, anticlockwise seen from outside
+
+
+def pack_meshes(meshes: Sequence[Mesh | None]) -> Meshes:
+    """The arrays of the meshes of a scene: one for each row of scene/, then of object_parts/; None for other kinds."""
+    own = [(part, mesh) for part, mesh in enumerate(meshes) if mesh is not None]
+    starts = np.cumsum([0, *(len(mesh.vertices) for _, mesh in own)])
+    return Meshes(
+        mesh_points=np.concatenate([np.zeros((0, 3)), *(mesh.vertices for _, mesh in own)]).astype("<f4"),
+        mesh_part=np.repeat([part for part, _ in own], [len(mesh.vertices) for _, mesh in own]).astype("<i4"),
+        mesh_faces=np.concatenate([np.zeros((0, 3)), *(mesh.faces + start for (_, mesh), start in zip(own, starts))]).astype(
+            "<i4"
+        ),
+    )
+
+
+def meshes_of(record: Scene | Demo) -> tuple[list[Mesh | None], list[Mesh | None]]:
+    """The mesh of each part of the container and of each part of the object; None for those of other kinds."""
+    return _unpack_meshes(len(record.part_kind), len(record.object_kind), record if isinstance(record, Meshes) else None)
+
+
+def meshes_in(sample: Mapping[str, Array]) -> tuple[list[Mesh | None], list[Mesh | None]]:
+    """The same from one demo's arrays by path."""
+    arrays = {c.name: sample[c.metadata["path"]] for c in fields(Meshes) if c.metadata["path"] in sample}
+    return _unpack_meshes(len(sample["scene/kind"]), len(sample["object_parts/kind"]), Meshes(**arrays) if arrays else None)
+
+
+def _unpack_meshes(P: int, Q: int, meshes: Meshes | None) -> tuple[list[Mesh | None], list[Mesh | None]]:
+    """The inverse of `pack_meshes`, for P parts of the container and Q of the object."""
+    found: list[Mesh | None] = [None] * (P + Q)
+    if meshes is None:
+        return found[:P], found[P:]
+    for part in np.unique(meshes.mesh_part):
+        own = meshes.mesh_part == part
+        faces = meshes.mesh_faces[own[meshes.mesh_faces[:, 0]]]
+        found[int(part)] = Mesh(meshes.mesh_points[own].astype(float), (np.cumsum(own) - 1)[faces])
+    return found[:P], found[P:]
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from dapdata.errors import UsageError, hint
-from dapdata.records import columns, is_ragged
+from dapdata.records import RECORDS, Meshes, columns, is_ragged
 
 KINDS = ("recipe", "manifest", "shard", "report")
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
@@ -43,17 +43,19 @@ def schema(kind: str) -> dict[str, Any]:
 
 def shard_schema() -> dict[str, Any]:
     """The schema of {path of an array: its zarr.json} for all arrays of a shard."""
-    arrays = {column.metadata["path"]: _array_schema(column.metadata) for column in columns()}
-    for column in columns():
+    arrays: dict[str, Any] = {}
+    for column in columns(*RECORDS, Meshes):
+        arrays[column.metadata["path"]] = _array_schema(column.metadata)
         if is_ragged(column):
             arrays.setdefault(f"{column.metadata['path'].split('/')[0]}/offsets", _offsets_schema())
+    of_meshes = {column.metadata["path"].split("/")[0] for column in columns(Meshes)}
     return {
         "$schema": DIALECT,
         "title": "Shard",
         "description": "The arrays of a shard, a Zarr v3 group: path of each array -> its zarr.json.",
         "type": "object",
         "properties": dict(sorted(arrays.items())),
-        "required": sorted(arrays),
+        "required": sorted(path for path in arrays if path.split("/")[0] not in of_meshes),
         "additionalProperties": False,
     }
 

@@ -4,6 +4,9 @@ Everything runs in the container frame (a container is only ever turned about th
 in one simulation a scene that is built from nothing, so that a result does not depend on what was simulated before.
 Containers and clutter are fixed, as in RPDiff. Several copies of the object share a simulation without seeing each other.
 
+A part that is a mesh is its convex hull if it is convex (then its distances and overlaps are as exact as a box's), else, of
+a container, the surface as it is, which knows no inside.
+
 The judge's motion decides both whether a candidate goal can be reached and whether a prediction can be executed: the
 object is held (teleported) in its rotation and moved in against the approach of the place it goes to, which is the
 container's opening, or along a peg. A held body pushes with no force in a rigid simulator; its push is stated as depth of
@@ -15,19 +18,35 @@ What hangs (on a peg) swings into place: its candidates are let go for HANG_SECO
 from __future__ import annotations
 
 import os
+import tempfile
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cache
+from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dapdata import solids
+from dapdata import meshes, solids
 from dapdata.config import Section, key
 from dapdata.errors import UsageError, require
 from dapdata.poses import inverse, pose, rotation_about, symmetric_distance, tilt, transform
-from dapdata.records import GOAL_KINDS, PART_KINDS, REJECT_REASONS, ROLES, SYMMETRIES, Demo, Rejected, Scene, Verdict
+from dapdata.records import (
+    GOAL_KINDS,
+    PART_KINDS,
+    REJECT_REASONS,
+    ROLES,
+    SYMMETRIES,
+    Demo,
+    Mesh,
+    MeshDemo,
+    Meshes,
+    Rejected,
+    Scene,
+    Verdict,
+    meshes_of,
+)
 
 Array = NDArray[Any]
 
@@ -51,6 +70,8 @@ MAX_PARTS = 16  # of an object: PyBullet makes no shape of more, and says nothin
 HANG_SECONDS = 1.0  # s until a mug that was put onto a peg hangs still; most do after 0.4
 HANG_SHIFT = 0.1  # m: one that came further has fallen off
 HANG_ROLLING = 0.001  # rolling and spinning friction of what hangs: without it, mugs jitter on a peg at up to 9 mm/s
+OPPOSING = 0.75  # cosine: what an object meets more obliquely than this, it slides along
+HULL_MARGIN = 0.001  # m: PyBullet rounds hulls of a compound by this, on their outside; it can only be undone for single ones
 
 RPDIFF_SECONDS = 1.0  # s of physics after the release
 RPDIFF_ATTEMPTS = 11
@@ -96,11 +117,27 @@ def demonstrate(scene: Scene, config: PlacementConfig, rng: np.random.Generator)
     codes = [REJECT_REASONS.index(reasons[g]) for g in lost]
     if not kept:
         return Rejected(REJECT_REASONS[int(np.bincount(codes).argmax())])
+    return record(scene, settled, kept, lost, codes, kept[int(rng.integers(len(kept)))])
+
+
+def record(
+    scene: Scene, settled: Array, kept: Sequence[int], lost: Sequence[int], codes: Sequence[int], demonstrated: int
+) -> Demo:
+    """The scene with its candidates sorted into goals and rejected ones, and one of the goals demonstrated.
+
+    Args:
+        scene: With G candidates.
+        settled: (G, 4, 4) where they came to rest, container frame.
+        kept: Which of them are goals.
+        lost: Which of them are not.
+        codes: Why, each an index into REJECT_REASONS.
+        demonstrated: One of `kept`.
+    """
     goals = scene.T_world_container @ settled[kept]
-    return Demo(
+    demo = Demo(
         T_world_container=scene.T_world_container,
         T_world_object_start=scene.T_world_object_start,
-        T_world_object_goal=goals[int(rng.integers(len(kept)))],
+        T_world_object_goal=scene.T_world_container @ settled[demonstrated],
         goals=goals,
         goal_kind=scene.goal_kind[kept],
         goal_clearance=scene.goal_clearance[kept],
@@ -125,6 +162,41 @@ def demonstrate(scene: Scene, config: PlacementConfig, rng: np.random.Generator)
         attempts=np.array(0),
         task=np.array(scene.task),
     )
+    if isinstance(scene, Meshes):
+        return MeshDemo(**vars(demo), **{field.name: getattr(scene, field.name) for field in fields(Meshes)})
+    return demo
+
+
+def drop(scene: Scene | Demo, T_container_object: Array, config: PlacementConfig, seconds: float) -> Array:
+    """(G, 4, 4) where objects come to that are let go at (G, 4, 4) poses, container frame, after so many seconds."""
+    world = _World(scene, config)
+    bodies = world.release(T_container_object)
+    world.run(seconds)
+    return world.states(bodies)[0]
+
+
+def free_play(scene: Scene | Demo, T_container_object: Array, config: PlacementConfig, num_directions: int = 18) -> Array:
+    """(G,) total way (m) that an object can slide to and fro along its tightest horizontal line, for parts of any kind.
+
+    As solids.free_play, but by the nearest points of what stands around it, and for an object at rest, which often leans
+    against something: in a corner it can slide along either wall. Exact between flat walls, elsewhere as far as the tangent
+    planes let it. Ways longer than solids.UNBOUNDED count as that.
+    """
+    world = _World(scene, config)
+    angle = np.pi * np.arange(num_directions) / num_directions
+    line = np.stack([np.cos(angle), np.sin(angle), np.zeros(num_directions)], axis=1)
+    plays = []
+    for T in T_container_object:
+        around = [c for c in world.contacts(T, solids.UNBOUNDED) if abs(c.normal[2]) < SUPPORTING]
+        normal = np.array([contact.normal for contact in around]).reshape(-1, 3)
+        distance = np.array([max(contact.distance, 0.0) for contact in around])
+        ways = []
+        for direction in (line, -line):
+            closing = -direction @ normal.T  # (L, C)
+            way = np.where(closing > OPPOSING, distance / np.maximum(closing, OPPOSING), np.inf)
+            ways.append(way.min(axis=1, initial=solids.UNBOUNDED))
+        plays.append(min(float((ways[0] + ways[1]).min()), solids.UNBOUNDED))
+    return np.array(plays)
 
 
 def settle(
@@ -458,15 +530,19 @@ class _World:
         self._config = config
         self._object = tuple(np.asarray(x) for x in (scene.object_kind, scene.object_size, scene.T_object_part))
         parts = tuple(np.asarray(x) for x in (scene.part_kind, scene.part_size, scene.T_container_part))
-        for name, arrays in (("container part", parts), ("object part", self._object)):
-            _check_solids(name, *arrays)
-        self._T_object_body = _object_body(*self._object)
+        part_meshes, self._object_meshes = meshes_of(scene)
+        for name, arrays, found in (("container part", parts, part_meshes), ("object part", self._object, self._object_meshes)):
+            _check_parts(name, found, *arrays)
+        self._T_object_body = _object_body(self._object, self._object_meshes)
         self._bounds = solids.bounds(*parts)  # (P, 2, 3)
         container = self._bounds[np.asarray(scene.part_role) == ROLES.index("container")]
         self._inside = np.stack([container[:, 0].min(axis=0), container[:, 1].max(axis=0)])
         self._bullet, self._client = _client(os.getpid())
         self._start()
-        self._parts = [self._body(0.0, T, self._shape(int(kind), size)) for kind, size, T in zip(*parts)]
+        self._parts = [
+            self._body(0.0, T, self._shape(int(kind), size, mesh), mesh is not None)
+            for kind, size, T, mesh in zip(*parts, part_meshes)
+        ]
         self._probe = self._copy(0.0, np.eye(4))
         self._bullet.setCollisionFilterGroupMask(self._probe, -1, 0, 0, physicsClientId=self._client)
 
@@ -483,7 +559,7 @@ class _World:
         self._visual = b.createVisualShape(b.GEOM_BOX, halfExtents=[0.01] * 3, physicsClientId=client)
         self.pull(0, 0)
 
-    def _body(self, mass: float, T: Array, shape: int) -> int:
+    def _body(self, mass: float, T: Array, shape: int, is_mesh: bool) -> int:
         """A body of a shape at a pose."""
         b = self._bullet
         body: int = b.createMultiBody(
@@ -491,6 +567,8 @@ class _World:
         )
         if self._config.friction != 0.5:  # PyBullet's default
             b.changeDynamics(body, -1, lateralFriction=self._config.friction, physicsClientId=self._client)
+        if is_mesh:  # a single one is then as exact as a box
+            b.changeDynamics(body, -1, collisionMargin=0, physicsClientId=self._client)
         if self.hangs:
             rolling = {"rollingFriction": HANG_ROLLING, "spinningFriction": HANG_ROLLING}
             b.changeDynamics(body, -1, **rolling, physicsClientId=self._client)
@@ -499,23 +577,45 @@ class _World:
     def _copy(self, mass: float, T: Array) -> int:
         """A copy of the object at T."""
         kind, size, T_object_part = self._object
+        found = self._object_meshes
         if len(kind) == 1:
-            return self._body(mass, T @ self._T_object_body, self._shape(int(kind[0]), size[0]))
-        T_body_part = inverse(self._T_object_body) @ T_object_part
-        return self._body(mass, T @ self._T_object_body, self._compound(kind, size, T_body_part))
+            shape = self._shape(int(kind[0]), size[0], found[0])
+        else:
+            shape = self._compound(kind, size, inverse(self._T_object_body) @ T_object_part, found)
+        return self._body(mass, T @ self._T_object_body, shape, found[0] is not None)
 
-    def _shape(self, kind: int, size: Array) -> int:
-        """The collision shape of one solid."""
+    def _shape(self, kind: int, size: Array, mesh: Mesh | None) -> int:
+        """The collision shape of one part."""
         b, client = self._bullet, self._client
+        if mesh is not None:
+            if meshes.is_convex(mesh):
+                return int(b.createCollisionShape(b.GEOM_MESH, vertices=mesh.vertices.tolist(), physicsClientId=client))
+            mesh = meshes.with_area(mesh)
+            return int(
+                b.createCollisionShape(
+                    b.GEOM_MESH,
+                    vertices=mesh.vertices.tolist(),
+                    indices=mesh.faces.ravel().tolist(),
+                    flags=b.GEOM_FORCE_CONCAVE_TRIMESH,
+                    physicsClientId=client,
+                )
+            )
         if kind == solids.BOX:
             return int(b.createCollisionShape(b.GEOM_BOX, halfExtents=(size / 2).tolist(), physicsClientId=client))
         if kind == solids.CYLINDER:
             return int(b.createCollisionShape(b.GEOM_CYLINDER, radius=size[0] / 2, height=size[2], physicsClientId=client))
         return int(b.createCollisionShape(b.GEOM_MESH, vertices=_ellipsoid_hull(size), physicsClientId=client))
 
-    def _compound(self, kind: Array, size: Array, T: Array) -> int:
-        """One collision shape of several solids."""
+    def _compound(self, kind: Array, size: Array, T: Array, found: Sequence[Mesh | None]) -> int:
+        """One collision shape of several parts, all of them meshes or none."""
         b = self._bullet
+        hulls = [Mesh(transform(pose_, mesh.vertices), mesh.faces) for pose_, mesh in zip(T, found) if mesh is not None]
+        if hulls:
+            # PyBullet makes a compound of hulls from a file alone, and remembers files by their name.
+            with tempfile.TemporaryDirectory(prefix="dapdata-") as folder:
+                path = Path(folder, "hulls.obj")
+                path.write_text(meshes.to_obj([meshes.shrunk(mesh, HULL_MARGIN) for mesh in hulls]))
+                return int(b.createCollisionShape(b.GEOM_MESH, fileName=str(path), physicsClientId=self._client))
         placed = [_to_bullet(pose_) for pose_ in T]
         return int(
             b.createCollisionShapeArray(
@@ -656,9 +756,15 @@ class _World:
         return poses, np.array(speeds, np.float64)
 
 
-def _object_body(kind: Array, size: Array, T_object_part: Array) -> Array:
-    """(4, 4) the frame of PyBullet's body in the object's: that of its solid, or at the centre of mass of several."""
-    return T_object_part[0] if len(kind) == 1 else pose(None, solids.centre_of_mass(kind, size, T_object_part))
+def _object_body(parts: tuple[Array, ...], found: Sequence[Mesh | None]) -> Array:
+    """(4, 4) the frame of PyBullet's body in the object's: that of its part, or at the centre of mass of several."""
+    kind, size, T_object_part = parts
+    if len(kind) == 1:
+        return np.asarray(T_object_part[0])
+    volumes = [meshes.volume(mesh) for mesh in found if mesh is not None]
+    if volumes:  # each piece of an object has its origin at its own centre of mass
+        return pose(None, np.average(T_object_part[:, :3, 3], axis=0, weights=volumes))
+    return pose(None, solids.centre_of_mass(kind, size, T_object_part))
 
 
 def _places(scene: Scene | Demo) -> Array:
@@ -668,17 +774,26 @@ def _places(scene: Scene | Demo) -> Array:
     return transform(inverse(scene.T_world_container), scene.goals[:, :3, 3])
 
 
-def _check_solids(name: str, kind: Array, size: Array, T: Array) -> None:
+def _check_parts(name: str, found: Sequence[Mesh | None], kind: Array, size: Array, T: Array) -> None:
     """PyBullet crashes on some bad numbers and accepts others silently."""
     if not len(kind):
-        raise UsageError(f"{name}: got none, expected at least one; see records.Scene")
-    if np.any(kind == solids.MESH) or np.any(kind >= len(PART_KINDS)):
-        raise UsageError(
-            f"{name}: got a mesh, expected {', '.join(PART_KINDS[: solids.MESH])}; simulation knows primitives only"
-        )
+        raise UsageError(f"{name}: got none, expected at least one; if the data were imported, import them with their meshes")
+    if np.any(kind >= len(PART_KINDS)):
+        raise UsageError(f"{name}: got kind {int(kind.max())}, expected one of {', '.join(PART_KINDS)}; see records.Scene")
+    for k, mesh in zip(kind, found):
+        if (k == solids.MESH) != (mesh is not None):
+            raise UsageError(
+                f"{name}: got a {PART_KINDS[int(k)]} {'with' if mesh else 'without'} triangles; see records.Meshes"
+            )
+        if mesh is not None and (problem := meshes.fault(mesh)):
+            raise UsageError(f"{name}: got a mesh with {problem}")
+        if mesh is not None and name == "object part" and not meshes.is_convex(mesh):
+            raise UsageError(f"{name}: got a mesh that is not convex, expected convex pieces; see meshes.convex_pieces")
+    if name == "object part" and len(kind) > 1 and 0 < np.sum(kind == solids.MESH) < len(kind):
+        raise UsageError(f"{name}: got meshes among other kinds, expected one or the other; make all of them meshes")
     if name == "object part" and len(kind) > 1 and np.any(kind == solids.ELLIPSOID):
         raise UsageError(f"{name}: got an ellipsoid among {len(kind)} parts, expected boxes and cylinders; use it on its own")
-    if name == "object part" and len(kind) > MAX_PARTS:
+    if name == "object part" and len(kind) > MAX_PARTS and not np.any(kind == solids.MESH):
         raise UsageError(f"{name}: got {len(kind)}, expected {MAX_PARTS} at the most; build the object from fewer")
     if not (np.all(np.isfinite(T)) and np.all(np.isfinite(size)) and np.all(size > 0)):
         raise UsageError(f"{name}: got sizes or poses that are not finite or not positive, expected metres; correct the scene")
@@ -730,3 +845,14 @@ def _from_bullet(position: Sequence[float], quaternion: Sequence[float]) -> Arra
         ),
         np.asarray(position, np.float64),
     )
+
+
+def from_pose7(values: Sequence[float]) -> Array:
+    """The pose of x, y, z, m, and a unit quaternion x, y, z, w: the seven numbers of PyBullet and of RPDiff."""
+    return _from_bullet(values[:3], values[3:])
+
+
+def to_pose7(T: Array) -> list[float]:
+    """The inverse of `from_pose7`, for (4, 4)."""
+    position, rotation = _to_bullet(T)
+    return [*position, *rotation]

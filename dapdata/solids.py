@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from dapdata.errors import UsageError, require
 from dapdata.poses import pose, transform
-from dapdata.records import PART_KINDS
+from dapdata.records import PART_KINDS, Mesh
 
 Array = NDArray[Any]
 Vector = Array | Sequence[float]
@@ -126,13 +126,13 @@ def digest(*arrays: Array) -> int:
 
 
 def bounds(kind: Array, size: Array, T: Array) -> Array:
-    """(P, 2, 3) smallest axis-aligned boxes (low corner, high corner) of the solids, exact for the three primitives."""
-    _refuse_meshes(kind)
+    """(P, 2, 3) axis-aligned boxes (low corner, high corner) around the solids, the smallest for the three primitives."""
     R, half = T[:, :3, :3], size / 2
     box_half = np.einsum("pij,pj->pi", np.abs(R), half)
     round_half = np.sqrt(np.einsum("pij,pj->pi", R**2, half**2))
     disc_half = np.sqrt(np.einsum("pij,pj->pi", R[:, :, :2] ** 2, half[:, :2] ** 2)) + np.abs(R[:, :, 2]) * half[:, 2:]
-    extent = np.where((kind == BOX)[:, None], box_half, np.where((kind == CYLINDER)[:, None], disc_half, round_half))
+    is_box = (kind == BOX) | (kind == MESH)
+    extent = np.where(is_box[:, None], box_half, np.where((kind == CYLINDER)[:, None], disc_half, round_half))
     centre = T[:, :3, 3]
     return np.stack([centre - extent, centre + extent], axis=1)
 
@@ -257,15 +257,18 @@ class Faces:
     """F flat faces that look up: the places on which something could stand."""
 
     part: Array  # (F,) index of the solid
-    T: Array  # (F, 4, 4) pose of the face: origin in its centre, z its normal
-    size: Array  # (F, 2) full extents along the face's x and y, m
+    T: Array  # (F, 4, 4) pose of the face: origin in its centre, z its normal. Triangle: origin a corner, x and y its edges
+    size: Array  # (F, 2) full extents along the face's x and y, m; of a triangle 1
     is_disc: Array  # (F,) bool, whether it is a disc instead of a rectangle
+    is_triangle: Array  # (F,) bool, whether it is a triangle of a mesh
     area: Array  # (F,) m2
 
 
 def upward_faces(kind: Array, size: Array, T: Array, max_slope: float = 0.1) -> Faces:
-    """The faces of boxes and the caps of cylinders whose normal is within max_slope (rad) of z; covered or not."""
-    _refuse_meshes(kind)
+    """The faces of boxes and the caps of cylinders whose normal is within max_slope (rad) of z; covered or not.
+
+    Parts that are meshes have none here, see meshes.upward_faces.
+    """
     found: list[tuple[int, Array, Array, bool]] = []
     for p, (k, full, pose_) in enumerate(zip(kind, size, T)):
         for axis in range(3) if k == BOX else (2,) if k == CYLINDER else ():
@@ -283,6 +286,7 @@ def upward_faces(kind: Array, size: Array, T: Array, max_slope: float = 0.1) -> 
         T=np.array([f[1] for f in found]).reshape(-1, 4, 4),
         size=extent,
         is_disc=is_disc,
+        is_triangle=np.zeros(len(found), bool),
         area=extent.prod(axis=1) * np.where(is_disc, np.pi / 4, 1.0),
     )
 
@@ -290,7 +294,11 @@ def upward_faces(kind: Array, size: Array, T: Array, max_slope: float = 0.1) -> 
 def points_on_faces(faces: Faces, count: int, rng: np.random.Generator) -> Array:
     """(count, 3) points, uniform over the area of all faces together, m; there must be a face."""
     face = rng.choice(len(faces.area), size=count, p=faces.area / faces.area.sum())
-    flat = np.concatenate([_flat_points(faces.is_disc[face], count, rng) * faces.size[face] / 2, np.zeros((count, 1))], axis=1)
+    half_way = _flat_points(faces.is_disc[face], count, rng) / 2
+    in_square = half_way + 0.5  # a point beyond a triangle's third edge is turned back into it
+    in_triangle = np.where(in_square.sum(axis=1, keepdims=True) > 1, 1 - in_square, in_square)
+    planar = np.where(faces.is_triangle[face, None], in_triangle, half_way) * faces.size[face]
+    flat = np.concatenate([planar, np.zeros((count, 1))], axis=1)
     return np.asarray(np.einsum("nij,nj->ni", faces.T[face, :3, :3], flat) + faces.T[face, :3, 3])
 
 
@@ -351,21 +359,26 @@ def _ellipsoid_surface(half: Array, count: int, rng: np.random.Generator) -> Arr
     return points[:count]
 
 
-def to_trimesh(kind: Array, size: Array, T: Array, sections: int = 64) -> Any:
-    """One `trimesh.Trimesh` of all solids, not united; cylinders with `sections` sides, ellipsoids as icospheres."""
+def to_trimesh(kind: Array, size: Array, T: Array, sections: int = 64, meshes: Sequence[Mesh | None] = ()) -> Any:
+    """One `trimesh.Trimesh` of all parts, not united; cylinders with `sections` sides, ellipsoids as icospheres.
+
+    `meshes` has the triangles of each part that is a mesh, and None for the others; it may be left out if there are none.
+    """
     trimesh = require("trimesh", "sim")
-    _refuse_meshes(kind)
-    meshes = []
-    for k, full, pose_ in zip(kind, size, T):
-        if k == BOX:
+    found = []
+    for k, full, pose_, triangles in zip(kind, size, T, meshes or [None] * len(kind)):
+        if triangles is not None:
+            mesh = trimesh.Trimesh(triangles.vertices, triangles.faces, process=False)
+        elif k == BOX:
             mesh = trimesh.creation.box(extents=full)
         elif k == CYLINDER:
             mesh = trimesh.creation.cylinder(radius=full[0] / 2, height=full[2], sections=sections)
         else:
+            _refuse_meshes(k)
             mesh = trimesh.creation.icosphere(subdivisions=4, radius=0.5)
             mesh.apply_scale(full)
-        meshes.append(mesh.apply_transform(pose_))
-    return trimesh.util.concatenate(meshes)
+        found.append(mesh.apply_transform(pose_))
+    return trimesh.util.concatenate(found)
 
 
 class Node(NamedTuple):

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from dapdata import durable
+from dapdata import durable, rng
 from dapdata.errors import UsageError
 from dapdata.records import Record, Rejected
 
@@ -27,7 +27,21 @@ FORMAT = 1  # part of every key: another format makes every unit anew
 
 Inputs = Mapping[str, Any]  # records of the stages that are needed, by the stage's name
 Sections = Mapping[str, Any]  # the stage's own recipe sections by name
-Draw = Callable[[str], np.random.Generator]  # the generator of this demo and attempt, for a purpose such as "scene"
+
+
+@dataclass(frozen=True)
+class Draw:
+    """One attempt at one demo, and its generators."""
+
+    seed: int
+    demo: int
+    attempt: int = 0
+
+    def __call__(self, purpose: str) -> np.random.Generator:
+        """The generator for a purpose such as "scene"."""
+        return rng.stream(self.seed, purpose, self.demo, self.attempt)
+
+
 Run = Callable[[Inputs, Sections, Draw], Record | Rejected]
 Spec = dict[str, Any]  # what a stage's results follow from, but for the seed and the demos
 

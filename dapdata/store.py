@@ -24,7 +24,7 @@ import numpy as np
 
 from dapdata import durable
 from dapdata.errors import CorruptionError
-from dapdata.records import Array, Record, columns, is_ragged
+from dapdata.records import PART_KINDS, RECORDS, Array, Meshes, Record, columns, is_ragged
 
 FORMAT = 1
 MAX_CHUNK_ROWS = 32768  # fewer rows in a chunk make reading and writing slower, more make nothing faster
@@ -42,6 +42,7 @@ INDEX_INTO = {  # codes that count rows of another group of the same demo
     "object/superpoint": "object_superpoints",
     "correspondence/container_superpoint": "container_superpoints",
     "correspondence/object_superpoint": "object_superpoints",
+    "mesh_faces/vertices": "mesh_vertices",
 }
 
 
@@ -67,7 +68,7 @@ class Block:
         return slice(int(offsets[row]), int(offsets[row + 1]))
 
 
-COLUMNS: dict[str, Field[Any]] = {column.metadata["path"]: column for column in columns()}
+COLUMNS: dict[str, Field[Any]] = {column.metadata["path"]: column for column in columns(*RECORDS, Meshes)}
 
 
 def offsets_path(path: str) -> str:
@@ -133,6 +134,19 @@ def problems(sample: Sample) -> Iterator[str]:
             low, high = int(sample[path].min()), int(sample[path].max())
             if low < 0 or high >= rows[target]:
                 yield f"{path}: {low} to {high}, expected rows of {target}, 0 to {rows[target] - 1}"
+                return
+    if "mesh_vertices/part" in sample:
+        yield from _mesh_problems(sample)
+
+
+def _mesh_problems(sample: Sample) -> Iterator[str]:
+    """Whether exactly the parts whose kind is mesh have vertices, and each face is of one part."""
+    part, kind = sample["mesh_vertices/part"], np.concatenate([sample["scene/kind"], sample["object_parts/kind"]])
+    meshes = np.flatnonzero(kind == PART_KINDS.index("mesh"))
+    if not np.array_equal(np.unique(part), meshes):
+        yield f"mesh_vertices/part: of parts {np.unique(part).tolist()}, expected of those that are meshes, {meshes.tolist()}"
+    elif (np.ptp(part[sample["mesh_faces/vertices"]], axis=1) > 0).any():
+        yield "mesh_faces/vertices: a face with vertices of several parts, expected of one"
 
 
 def _value_problems(path: str, array: Array, about: Mapping[str, Any]) -> Iterator[str]:

@@ -13,17 +13,16 @@ import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from dapdata import card, croissant, durable, manifest, remote, rng, split, store
+from dapdata import card, croissant, durable, manifest, remote, split, store
 from dapdata.config import SplitConfig
 from dapdata.errors import CorruptionError, DapdataError, EnvironmentProblem, UsageError
 from dapdata.manifest import Manifest, MissingEntry, Rejects, SplitEntry, StageEntry, UnitEntry
 from dapdata.records import Demo, Record, Rejected, read_record, to_sample
-from dapdata.stages import Layout, Spec, Stage, Unit, changes, specs
+from dapdata.stages import Draw, Layout, Spec, Stage, Unit, changes, specs
 from dapdata.tables import Index, insert_words, writer
 
 CALL = "dapdata.units:run_unit"
@@ -96,9 +95,9 @@ def _make(work: Work, root: Path) -> dict[str, Any]:
         for need in stage.needs:
             if need not in made:
                 made[need] = _load(layout, stages[need], unit)
-        made[stage.name], rejects = _run_stage(stage, recipe, made, unit)
+        made[stage.name], rejects, rejected = _run_stage(stage, recipe, made, unit)
         ran, ran_cpu = time.perf_counter(), time.process_time()
-        size = _commit(layout, stages, stage, unit, made, rejects)
+        size = _commit(layout, stages, stage, unit, made, rejects, rejected)
         told.append(
             {
                 "stage": stage.name,
@@ -128,34 +127,35 @@ def _check_versions(work: Work, here: Mapping[str, Spec]) -> None:
 # Running a stage -------------------------------------------------------------------------------------------
 
 
-def _run_stage(stage: Stage, recipe: Any, made: Mapping[str, Made], unit: Unit) -> tuple[Made, dict[str, Counter[str]]]:
-    """The records of a unit's demos in one stage, and how many attempts and demos were rejected, by reason."""
+def _run_stage(
+    stage: Stage, recipe: Any, made: Mapping[str, Made], unit: Unit
+) -> tuple[Made, dict[str, Counter[str]], list[dict[str, Any]]]:
+    """The records of a unit's demos in one stage; how many attempts and demos were rejected, by reason; and which demos."""
     sections = {name: getattr(recipe, name) for name in stage.sections}
     rejects: dict[str, Counter[str]] = {"attempts": Counter(), "demos": Counter(), "goals": Counter()}
     records: Made = {}
+    rejected: list[dict[str, Any]] = []
     for demo in range(unit.start, unit.stop):
         if any(demo not in made[need] for need in stage.needs):
             continue
         inputs = {need: made[need][demo] for need in stage.needs}
         reasons: Counter[str] = Counter()
+        last = Rejected("")
         for attempt in range(stage.attempts):
-            draw = partial(_draw, recipe.seed, demo, attempt)
-            result = stage.run(inputs, sections, draw)
+            result = stage.run(inputs, sections, Draw(recipe.seed, demo, attempt))
             if not isinstance(result, Rejected):
                 records[demo] = _finished(result, recipe.seed, demo, attempt)
                 break
+            last = result
             reasons[result.reason] += 1
         if stage.attempts == 1:
             rejects["demos"] += reasons
+            rejected += [{"demo": demo, "reason": last.reason, "detail": last.detail}] if reasons else []
         elif demo not in records:
             raise UsageError(_no_demo(recipe, stage, demo, reasons))
         else:
             rejects["attempts"] += reasons
-    return records, rejects
-
-
-def _draw(seed: int, demo: int, attempt: int, purpose: str) -> Any:
-    return rng.stream(seed, purpose, demo, attempt)
+    return records, rejects, rejected
 
 
 def _finished(record: Record, seed: int, demo: int, attempt: int) -> Record:
@@ -201,6 +201,7 @@ def _commit(
     unit: Unit,
     made: Mapping[str, Made],
     rejects: dict[str, Counter[str]],
+    rejected: Sequence[dict[str, Any]],
 ) -> int:
     """Checks, writes and commits a unit; the bytes that were written for it."""
     parts = [stages[name] for name in layout.plan if stage.is_shard and name in stage.needs] + [stage]
@@ -217,6 +218,7 @@ def _commit(
         "key": layout.key(stage.name, unit),
         "demo_range": [unit.start, unit.stop],
         "rejects": {what: dict(sorted(counts.items())) for what, counts in rejects.items()},
+        **({"rejected": list(rejected)} if rejected else {}),
         "rows": [_row(demo, sample, stage.is_shard) for demo, sample in zip(demos, samples)],
     }
     lenders = list(_lenders(layout, stage, unit, demos)) if stage.is_shard else []

@@ -123,7 +123,20 @@ def layers(sample: Sample, goals: Mapping[str, tuple[Sequence[float], float]] = 
     yield {"kind": "cloud", "name": "container cloud", "cloud": "container", "on": True}
     yield {"kind": "cloud", "name": "object cloud, start pose", "cloud": "object", "on": True}
     moved = (sample["pose/T_world_object_goal"] @ T_object_start).ravel().tolist()
-    yield {"kind": "cloud", "name": "object cloud, demonstrated", "cloud": "object", "on": False, "T": moved}
+    is_known = len(sample["object_parts/kind"]) > 0  # else its cloud stands for its solids
+    yield {"kind": "cloud", "name": "object cloud, demonstrated", "cloud": "object", "on": not is_known, "T": moved}
+    if is_known:
+        yield from _goals(sample, goals)
+    yield _correspondences(sample)
+    for role, color in zip(records.ROLES, (WOOD, CLUTTER)):
+        if (sample["scene/role"] == records.ROLES.index(role)).any():
+            T = sample["pose/T_world_container"][None]
+            yield poses_layer(f"true parts: {role}", color, T, [role], on=False, opacity=1.0, solid=role)
+    yield _cameras(sample)
+
+
+def _goals(sample: Sample, goals: Mapping[str, tuple[Sequence[float], float]]) -> Iterator[Layer]:
+    """The object at its valid goals, and at each rejected candidate."""
     demonstrated = is_demonstrated(sample) if len(goals) == 2 else np.ones(len(sample["goals/kind"]), bool)
     kinds = [records.GOAL_KINDS[kind] for kind in sample["goals/kind"]]
     says = [f"goal {g}: {k}, {1000 * c:.0f} mm free play" for g, (k, c) in enumerate(zip(kinds, sample["goals/clearance"]))]
@@ -136,12 +149,6 @@ def layers(sample: Sample, goals: Mapping[str, tuple[Sequence[float], float]] = 
         if len(T):
             words = f"rejected: {reason.replace('_', ' ')}"
             yield poses_layer(words, REJECTED[reason], T, [words] * len(T), on=False, opacity=0.35)
-    yield _correspondences(sample)
-    for role, color in zip(records.ROLES, (WOOD, CLUTTER)):
-        if (sample["scene/role"] == records.ROLES.index(role)).any():
-            T = sample["pose/T_world_container"][None]
-            yield poses_layer(f"true parts: {role}", color, T, [role], on=False, opacity=1.0, solid=role)
-    yield _cameras(sample)
 
 
 def poses_layer(

@@ -12,7 +12,7 @@ from typing import Any
 
 from dapdata import keys, tasks
 from dapdata.recipe import recipe_class, summary
-from dapdata.records import columns, is_ragged
+from dapdata.records import RECORDS, Meshes, columns, is_ragged
 from dapdata.schemas import KINDS, schema
 
 ROOT = Path(__file__).parents[1]
@@ -60,6 +60,9 @@ up and z = 0 on the table top. The container frame has z up and its origin at th
 underside. The object frame has its origin at the centre of the object's bounding box, and z up at a goal (of a mug,
 which hangs: when it stands). Cameras have OpenCV axes: x right, y down, z ahead. There are no quaternions.
 
+A part that is a mesh has its triangles in `mesh_vertices/` and `mesh_faces/`; datasets without them, which are all
+that were not imported, have no such groups.
+
 `schemas/shard.schema.json` says the same for machines: it describes {{path of each array: its zarr.json}}.
 """
 
@@ -93,7 +96,7 @@ def pages() -> dict[Path, str]:
 def format_page() -> str:
     """The page on the format: prose and a table for each group of a shard."""
     groups: dict[str, list[Any]] = {}
-    for column in columns():
+    for column in columns(*RECORDS, Meshes):
         groups.setdefault(column.metadata["path"].split("/")[0], []).append(column)
     return FORMAT_TOP + "".join("\n" + "\n".join(_group_table(name, members)) + "\n" for name, members in groups.items())
 

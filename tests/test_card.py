@@ -111,7 +111,9 @@ def test_the_card_names_every_array_with_its_unit_and_frame(tiny: Path) -> None:
 
 
 def test_every_stage_has_a_word_in_the_card() -> None:
-    assert set(card.DOES) == {stage.name for stage in pipeline.STAGES}
+    imported = card.origin({"recipe": {"scene": {"source": "demos"}}})
+    for about in (card.DRAWN, imported):
+        assert {**card.DOES, **about.does}.keys() == {stage.name for stage in pipeline.STAGES}
 
 
 def test_an_unlabelled_dataset_says_what_to_run(tmp_path: Path) -> None:

@@ -22,6 +22,10 @@ from dapdata import cli, clouds, loading, metrics, predictions, tasks
 
 COMMANDS = typer.main.get_command(cli.app).commands  # type: ignore[attr-defined]
 NAMES = ", ".join(tasks.names())
+GROUPS = {name: command.commands for name, command in COMMANDS.items() if hasattr(command, "commands")}
+REPORTING = {name: command for name, command in COMMANDS.items() if name not in {*GROUPS, "init", "schema", "slurm"}} | {
+    f"{group} {name}": command for group, members in GROUPS.items() for name, command in members.items()
+}
 BAD = "scene:\n  task: can_cabinet\nlabel:\n  eps_place: 30\n"
 DAPDATA = [sys.executable, "-m", "dapdata"]
 
@@ -60,24 +64,24 @@ def test_without_a_command_the_help_is_shown(capsys: pytest.CaptureFixture[str])
     assert said().endswith("Start with: dapdata run recipes/quickstart.yaml\n")
 
 
-@pytest.mark.parametrize("name", COMMANDS)
+@pytest.mark.parametrize("name", sorted({*COMMANDS, *REPORTING}))
 def test_every_command_has_help_with_an_example(name: str, capsys: pytest.CaptureFixture[str]) -> None:
-    text = run(capsys, name, "--help")
+    text = run(capsys, *name.split(), "--help")
     assert f"Example: dapdata {name}" in text
-    for parameter in COMMANDS[name].params:
+    for parameter in REPORTING.get(name, COMMANDS.get(name)).params:  # type: ignore[union-attr]
         assert parameter.help, parameter.name
 
 
 def test_the_commands_are_those_of_the_interface() -> None:
     assert set(COMMANDS) == {
         "init", "generate", "label", "train", "eval", "judge", "predict", "run", "status", "inspect", "verify", "show", "gc",
-        "schema", "bench", "compare", "doctor", "export", "slurm",
+        "schema", "bench", "compare", "doctor", "import", "export", "slurm",
     }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", sorted(set(COMMANDS) - {"init", "schema", "export", "slurm"}))
+@pytest.mark.parametrize("name", sorted(REPORTING))
 def test_every_command_that_reports_does_so_for_machines_too(name: str) -> None:
-    assert "--json" in {option for parameter in COMMANDS[name].params for option in parameter.opts}
+    assert "--json" in {option for parameter in REPORTING[name].params for option in parameter.opts}
 
 
 def test_help_takes_less_than_half_a_second_of_the_processor() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import io
 import json
 import os
@@ -19,7 +18,7 @@ import pytest
 
 from dapdata import cli, durable, loading, manifest, pictures, pipeline, records, solids
 from dapdata.errors import LockedError, UsageError
-from dapdata.interop import export, parquet, pointcept, scenes, webdataset
+from dapdata.interop import export, parquet, pointcept, rpdiff, scenes, webdataset
 from dapdata.loading import Dataset
 from dapdata.poses import pose, random_rotation, rotation_about
 from dapdata.records import Array
@@ -30,14 +29,16 @@ EXPORTS: dict[str, Callable[..., Path]] = {
     "parquet": parquet.export,
     "pointcept": pointcept.export,
     "scenes": scenes.export,
+    "rpdiff": rpdiff.export,
 }
 QUICK: dict[str, dict[str, Any]] = {  # options that make small files quickly
     "webdataset": {"shard_size": 2},
     "parquet": {"shard_size": 2, "previews": False},
     "pointcept": {},
     "scenes": {},
+    "rpdiff": {"shard_size": 2},
 }
-SUFFIXES = (".tar", ".parquet", ".npy", ".glb")
+SUFFIXES = (".tar", ".parquet", ".npy", ".glb", ".npz")
 every_format = pytest.mark.parametrize("format", EXPORTS)
 
 
@@ -364,10 +365,10 @@ def test_yourdfpy_reads_the_frames_and_solids_of_a_urdf(scene_folders: Iterator[
         np.testing.assert_allclose(robot.collision_scene.bounds, expected, atol=1e-3)
 
 
-def shapes(kinds: list[int]) -> scenes.Solids:
+def shapes(kinds: list[int]) -> scenes.Parts:
     """One solid of each kind, apart from each other and turned."""
     T = np.stack([pose(rotation_about((1, 2, 3), 0.4 + i), (0.3 * i, 0, 0)) for i in range(len(kinds))])
-    return scenes.Solids(np.array(kinds, np.uint8), np.array([[0.1, 0.1, 0.2]] * len(kinds)), T)
+    return scenes.Parts(np.array(kinds, np.uint8), np.array([[0.1, 0.1, 0.2]] * len(kinds)), T, [None] * len(kinds))
 
 
 def test_solids_that_urdf_has_no_word_for_become_meshes(tmp_path: Path) -> None:
@@ -382,7 +383,9 @@ def test_solids_that_urdf_has_no_word_for_become_meshes(tmp_path: Path) -> None:
 
 
 def test_mass_and_inertia_are_those_of_the_solid() -> None:
-    inertial = scenes._inertial(scenes.Solids(np.array([0], np.uint8), np.array([[0.1, 0.2, 0.3]]), np.eye(4)[None]), 2.0)
+    inertial = scenes._inertial(
+        scenes.Parts(np.array([0], np.uint8), np.array([[0.1, 0.2, 0.3]]), np.eye(4)[None], [None]), 2.0
+    )
     found = {name: float(value) for name, value in inertial.find("inertia").attrib.items()}  # type: ignore[union-attr]
     expected = {"ixx": 2 / 12 * (0.2**2 + 0.3**2), "iyy": 2 / 12 * (0.1**2 + 0.3**2), "izz": 2 / 12 * (0.1**2 + 0.2**2)}
     assert {name: value for name, value in found.items() if value} == pytest.approx(expected)
@@ -537,19 +540,22 @@ def test_nothing_takes_its_name_before_it_is_on_the_disk(tiny: Path, tmp_path: P
 
 def test_demos_in_no_split_have_files_of_their_own(tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     chosen = export.choose(tiny)
-    owners = chosen.dataset.index["split"].astype("<U6")
-    owners[4] = "unused"
-    other = dataclasses.replace(chosen.dataset, index={**chosen.dataset.index, "split": owners})
-    monkeypatch.setattr(loading, "open", lambda root, split: other)
+    chosen.dataset.index["split"][4] = "unused"
+    monkeypatch.setattr(loading, "open", lambda root, split: chosen.dataset)
     assert export.choose(tiny).splits["unused"].tolist() == [4]
     out = webdataset.export(tiny, tmp_path / "out")
     assert (out / "unused-000000.tar").is_file()
     assert "`unused` demos share one with two splits" in (out / "README.md").read_text()
 
 
-def test_scenes_of_meshes_are_refused_and_nothing_is_left(tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(scenes, "_object", lambda sample: shapes([3]))
-    with pytest.raises(UsageError, match="got 'mesh', expected one of box, cylinder, ellipsoid"):
+def test_a_scene_that_nobody_knows_is_refused_and_nothing_is_left(
+    tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = Dataset.__getitem__
+    monkeypatch.setattr(
+        Dataset, "__getitem__", lambda self, number: whole(self, number) | {"object_parts/kind": np.zeros(0, np.uint8)}
+    )
+    with pytest.raises(UsageError, match=r"demo 0: nobody knows its solids, .* import the data with their meshes"):
         scenes.export(tiny, tmp_path / "out")
     assert not list(tmp_path.iterdir())
 
@@ -638,13 +644,13 @@ for name in ("pybullet", "trimesh", "open3d", "numba", "scipy", "matplotlib", "p
     sys.modules[name] = None
 from dapdata import cli
 codes = [cli.run_app(["export", name, sys.argv[1], "--out", f"{name}{len(more)}", *more]) for name, *more in
-         (["webdataset"], ["parquet", "--no-previews"], ["pointcept"], ["parquet"], ["scenes"])]
-assert codes == [0, 0, 0, 6, 6], codes
+         (["webdataset"], ["parquet", "--no-previews"], ["pointcept"], ["parquet"], ["scenes"], ["rpdiff"])]
+assert codes == [0, 0, 0, 6, 6, 6], codes
 """
 
 
 def test_without_extras_all_is_exported_but_pictures_and_solids(tiny: Path, tmp_path: Path) -> None:
     done = subprocess.run([sys.executable, "-c", LIGHT, tiny], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    assert done.stderr.count("pip install 'dapdata[sim]'") == 2
+    assert done.stderr.count("pip install 'dapdata[sim]'") == 3
     assert sorted(path.name for path in tmp_path.iterdir()) == ["parquet1", "pointcept0", "webdataset0"]

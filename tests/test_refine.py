@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.distance import pdist
 
 from dapdata.poses import angle_between, inverse, nearest_symmetric, pose, random_rotation, rotation_about, transform
 from daptrain.fit import ObjectFit, fit_container, fit_object, fit_opening, fit_yaw
@@ -209,7 +210,7 @@ def test_a_rough_candidate_ends_upright_square_and_in_the_gap() -> None:
             for _ in range(12)
         ]
     )
-    found = inverse(truth) @ refine(rough, scene, exact_book())
+    found = inverse(truth) @ refine(rough, scene, exact_book(), ["gravity", "yaw", "settle", "search"])
     assert np.abs(found[:, 2, 2]).min() > 0.9999
     assert np.rad2deg(angle_between(found[:, :3, :3], np.eye(3))).max() < 0.5
     sideways, height = np.abs(found[:, 0, 3]) * 1000, np.abs(found[:, 2, 3]) * 1000
@@ -275,6 +276,21 @@ def test_the_search_ends_in_the_middle_of_a_gap() -> None:
     off = np.stack([truth @ pose(translation=(shift, 0, 0)) for shift in (-0.012, -0.006, 0.006, 0.012)])
     found = inverse(truth) @ refine(off, observed_scene(points, normals), book, ["search"])
     assert np.abs(found[:, 0, 3]).max() < 0.003
+
+
+def test_candidates_for_one_place_try_it_each_elsewhere_and_the_first_of_a_place_stays() -> None:
+    points, normals, T_world_container = shelf(0.4)
+    scene, here = observed_scene(points, normals), at_gap(T_world_container)
+    there = here @ pose(translation=(0.05, 0, 0))
+    candidates = np.stack([here, there, *[here] * 3, np.full((4, 4), np.nan), *[here] * 3])
+    moved = (inverse(here) @ refine(candidates, scene, exact_book(), ["spread"]) - inverse(here) @ candidates)[:, :3, 3]
+    assert np.linalg.norm(moved[:2], axis=1) == pytest.approx(0)
+    assert np.isnan(moved[5]).all()
+    tries = moved[[0, 2, 3, 4, 6, 7, 8]]
+    assert np.linalg.norm(tries[1:], axis=1) == pytest.approx(0.003)
+    assert pdist(tries).min() > 0.0029
+    fewer = refine(candidates[:4], scene, exact_book(), ["spread"])
+    assert fewer == pytest.approx(refine(candidates, scene, exact_book(), ["spread"])[:4]), "whatever comes after them"
 
 
 # Ranking ---------------------------------------------------------------------------------------------------

@@ -191,4 +191,4 @@ def test_digests_are_equal_for_equal_geometry_only():
 
 def test_meshes_are_refused():
     with pytest.raises(UsageError, match="part kind: got 'mesh', expected one of box, cylinder, ellipsoid"):
-        solids.bounds(np.array([3]), np.ones((1, 3)), np.eye(4)[None])
+        solids.signed_distance(np.zeros((1, 3)), np.array([3]), np.ones((1, 3)), np.eye(4)[None])

@@ -1,1 +1,1 @@
-"""Datasets in the formats of other tools: one file for each, and what all exports have in common in `export`."""
+"""Other tools' formats, in and out: one or more files for each, and what all exports have in common in `export`."""

@@ -154,7 +154,7 @@ def run(out: str | Path, export: Export, progress: Progress | None = None) -> Pa
     Args:
         out: The folder; new, empty, or this same export.
         export: What to write.
-        progress: Called with demos done and demos in all.
+        progress: Called with demos done and demos in all; a demo of two pieces counts twice.
 
     Returns:
         The folder.
@@ -265,7 +265,7 @@ def _start(partial: Path, about: Mapping[str, Any]) -> None:
 
 
 def _write_pieces(partial: Path, export: Export, progress: Progress | None) -> None:
-    dataset, total, done = export.chosen.dataset, export.chosen.count, 0
+    dataset, total, done = export.chosen.dataset, sum(len(piece.numbers) for piece in export.pieces), 0
 
     def read(numbers: Array) -> Iterator[Row]:
         for i, number in enumerate(numbers.tolist(), 1):

@@ -20,9 +20,10 @@ import numpy as np
 
 from dapdata import durable, pictures, records, solids
 from dapdata.card import Form
+from dapdata.errors import UsageError
 from dapdata.interop.export import Export, Piece, Progress, Row, by_demo, choose, demo_name, readme, run
 from dapdata.poses import pose
-from dapdata.records import Array
+from dapdata.records import Array, Mesh
 from dapdata.solids import BOX, CYLINDER, Color, Node
 from dapdata.store import Sample
 
@@ -53,7 +54,7 @@ def export(
         progress: Called with demos done and demos in all.
 
     Raises:
-        UsageError: for a scene with parts that are no primitives.
+        UsageError: for a scene whose parts nobody knows, as of an import without meshes.
         MissingExtraError: without trimesh.
     """
     chosen = choose(dataset, split, demos)
@@ -87,6 +88,10 @@ T_world_object = trimesh.load("{folder}/scene.glb").graph.get("goal_000", "z_up"
 
 def _write(folder: Path, about: dict[str, Any], sample: Sample, mass: float, friction: float) -> None:
     """The files of one demo, in a new folder."""
+    if not len(sample["object_parts/kind"]):
+        raise UsageError(
+            f"demo {about['demo']}: nobody knows its solids, expected a scene to write; import the data with their meshes"
+        )
     folder.mkdir()
     demonstrated = int(np.flatnonzero(pictures.is_demonstrated(sample))[0])
     frames = list(_frames(sample, demonstrated))
@@ -111,12 +116,21 @@ def _write(folder: Path, about: dict[str, Any], sample: Sample, mass: float, fri
 # Frames ----------------------------------------------------------------------------------------------------
 
 
-class Solids(NamedTuple):
-    """P solids as in `solids`, their poses in the frame that holds them."""
+class Parts(NamedTuple):
+    """P parts as in `records.Scene`, their poses in the frame that holds them."""
 
     kind: Array  # (P,)
     size: Array  # (P, 3), m
     T: Array  # (P, 4, 4)
+    meshes: Sequence[Mesh | None]  # P
+
+    def of(self, rows: Array) -> Parts:
+        """Some of them."""
+        return Parts(self.kind[rows], self.size[rows], self.T[rows], [self.meshes[row] for row in rows])
+
+    def to_trimesh(self, sections: int = 64) -> Any:
+        """All of them as one `trimesh.Trimesh`, not united; cylinders with so many sides."""
+        return solids.to_trimesh(self.kind, self.size, self.T, sections, self.meshes)
 
 
 class Frame(NamedTuple):
@@ -125,39 +139,40 @@ class Frame(NamedTuple):
     name: str
     parent: str  # "" for the world
     T: Array  # (4, 4) T_parent_frame
-    solids: Solids
+    parts: Parts
     look: str  # key of COLORS
     collides: bool = False
 
     @property
     def mesh(self) -> str:
-        """Frames of one name show the same solids in the same colour."""
+        """Frames of one name show the same parts in the same colour."""
         return self.name if self.look == "clutter" else self.look
 
 
 def _frames(sample: Sample, demonstrated: int) -> Iterator[Frame]:
     """The frames of a scene, parents first."""
-    parts = Solids(sample["scene/kind"], sample["scene/size"], sample["scene/T_container_part"])
+    of_scene, _ = records.meshes_in(sample)
+    parts = Parts(sample["scene/kind"], sample["scene/size"], sample["scene/T_container_part"], of_scene)
     is_clutter = sample["scene/role"] == records.ROLES.index("clutter")
-    own = Solids(*(array[~is_clutter] for array in parts))
+    own = parts.of(np.flatnonzero(~is_clutter))
     yield Frame("container", "", sample["pose/T_world_container"], own, "container", collides=True)
     for i, part in enumerate(np.flatnonzero(is_clutter)):
-        kind, size, T_container_part = (array[part] for array in parts)
-        centred = Solids(kind[None], size[None], np.eye(4)[None])
-        yield Frame(f"clutter_{i:03d}", "container", T_container_part, centred, "clutter", collides=True)
+        centred = parts.of(np.array([part]))._replace(T=np.eye(4)[None])
+        yield Frame(f"clutter_{i:03d}", "container", parts.T[part], centred, "clutter", collides=True)
     thing = _object(sample)
     yield Frame("object_start", "", sample["pose/T_world_object_start"], thing, "object")
     for i, T_world_object in enumerate(sample["goals/T_world_object"]):
         yield Frame(f"goal_{i:03d}", "", T_world_object, thing, "demonstrated" if i == demonstrated else "goal")
 
 
-def _object(sample: Sample) -> Solids:
-    return Solids(sample["object_parts/kind"], sample["object_parts/size"], sample["object_parts/T_object_part"])
+def _object(sample: Sample) -> Parts:
+    _, of_object = records.meshes_in(sample)
+    return Parts(sample["object_parts/kind"], sample["object_parts/size"], sample["object_parts/T_object_part"], of_object)
 
 
 def _glb(frames: Sequence[Frame]) -> bytes:
     seen = {frame.mesh: frame for frame in frames}
-    meshes = {name: (solids.to_trimesh(*frame.solids, SECTIONS), COLORS[frame.look]) for name, frame in seen.items()}
+    meshes = {name: (frame.parts.to_trimesh(SECTIONS), COLORS[frame.look]) for name, frame in seen.items()}
     return solids.to_glb([Node(frame.name, frame.parent, frame.T, frame.mesh) for frame in frames], meshes)
 
 
@@ -192,11 +207,11 @@ def _link(frame: Frame, folder: Path, mass: float | None = None) -> ElementTree.
     """A link; the meshes of solids that URDF has no word for are written beside it."""
     link = ElementTree.Element("link", name=frame.name)
     if mass is not None:
-        link.append(_inertial(frame.solids, mass))
-    for i, (kind, size, T) in enumerate(zip(*frame.solids)):
+        link.append(_inertial(frame.parts, mass))
+    for i, (kind, size, T, _) in enumerate(zip(*frame.parts)):
         mesh = folder / f"{frame.mesh}_{i}.stl"
         if kind not in (BOX, CYLINDER) and not mesh.exists():
-            whole = solids.to_trimesh(kind[None], size[None], np.eye(4)[None])
+            whole = frame.parts.of(np.array([i]))._replace(T=np.eye(4)[None]).to_trimesh()
             mesh.write_bytes(whole.export(file_type="stl"))
         for role in ("visual", "collision") if frame.collides else ("visual",):
             element = ElementTree.SubElement(link, role)
@@ -213,9 +228,9 @@ def _link(frame: Frame, folder: Path, mass: float | None = None) -> ElementTree.
     return link
 
 
-def _inertial(parts: Solids, mass: float) -> ElementTree.Element:
-    """Mass, centre of mass and inertia of solids of one density; where they overlap it counts twice."""
-    mesh = solids.to_trimesh(*parts)
+def _inertial(parts: Parts, mass: float) -> ElementTree.Element:
+    """Mass, centre of mass and inertia of parts of one density; where they overlap it counts twice."""
+    mesh = parts.to_trimesh()
     mesh.density = mass / mesh.volume
     inertial = ElementTree.Element("inertial")
     _origin(inertial, pose(None, mesh.center_mass))

@@ -12,12 +12,13 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from dapdata.config import Section, key
-from dapdata.records import Cloud, Demo, Rejected
+from dapdata.records import PART_KINDS, Cloud, Demo, Rejected, meshes_of
 
 if TYPE_CHECKING:
     from dapdata.observe.cameras import View
     from dapdata.observe.fuse import Fused
-    from dapdata.records import Array
+    from dapdata.observe.raycast import Image
+    from dapdata.records import Array, Mesh
 
 
 class CamerasConfig(Section):
@@ -82,15 +83,16 @@ def observe(demo: Demo, cameras: CamerasConfig, noise: NoiseConfig, rng: np.rand
 
     to_container = container_views(demo, cameras, noise, rng)
     to_object = object_views(demo, cameras, noise, rng)
+    part_meshes, object_meshes = meshes_of(demo)
     T_world_part = demo.T_world_container @ demo.T_container_part
     container, of_container = _look(
-        to_container, demo.part_kind, demo.part_size, T_world_part, cameras, noise, cameras.container_voxel
+        to_container, demo.part_kind, demo.part_size, part_meshes, T_world_part, cameras, noise, cameras.container_voxel
     )
     if len(container.points) < cameras.min_container_points:
         return Rejected("too_few_container_points")
     T_world_part = demo.T_world_object_start @ demo.T_object_part
     object_, of_object = _look(
-        to_object, demo.object_kind, demo.object_size, T_world_part, cameras, noise, cameras.object_voxel
+        to_object, demo.object_kind, demo.object_size, object_meshes, T_world_part, cameras, noise, cameras.object_voxel
     )
     if len(object_.points) < cameras.min_object_points:
         return Rejected("too_few_object_points")
@@ -107,22 +109,50 @@ def observe(demo: Demo, cameras: CamerasConfig, noise: NoiseConfig, rng: np.rand
 
 
 def _look(
-    views: list[View], kind: Array, size: Array, T_world_part: Array, cameras: CamerasConfig, noise: NoiseConfig, voxel: float
+    views: list[View],
+    kind: Array,
+    size: Array,
+    meshes: list[Mesh | None],
+    T_world_part: Array,
+    cameras: CamerasConfig,
+    noise: NoiseConfig,
+    voxel: float,
 ) -> tuple[Fused, Array]:
-    """The fused cloud of some parts, (P,) (P, 3) (P, 4, 4), through V views, and (V, 4, 4) the poses it was fused with."""
+    """The fused cloud of some parts, (P,) (P, 3) P (P, 4, 4), through V views, and (V, 4, 4) the poses it was fused with."""
     from dapdata.observe.align import align
     from dapdata.observe.fuse import fuse, view_cloud
     from dapdata.observe.noise import add_noise
-    from dapdata.observe.raycast import cast
     from dapdata.poses import inverse
 
     clouds = []
     for view in views:
         T_camera_part = inverse(view.T_world_camera_true) @ T_world_part
-        image = cast(kind, size, T_camera_part, view.K, view.width, view.height, cameras.near, cameras.far)
+        image = _image(view, kind, size, meshes, T_camera_part, cameras)
         clouds.append(view_cloud(add_noise(image, view.K, noise.preset, view.noise_seed), view))
     points, normals = [points for points, _ in clouds], [normals for _, normals in clouds]
     T_world_camera = np.stack([view.T_world_camera for view in views])
     if cameras.align and len(views) > 1:
         T_world_camera = align(views, points, normals)
     return fuse(points, normals, T_world_camera, voxel), T_world_camera
+
+
+def _image(
+    view: View, kind: Array, size: Array, meshes: list[Mesh | None], T_camera_part: Array, cameras: CamerasConfig
+) -> Image:
+    """What the view sees of parts of any kind."""
+    from dapdata.meshes import cast as cast_meshes
+    from dapdata.observe.raycast import Image, cast
+
+    frame = (view.K, view.width, view.height, cameras.near, cameras.far)
+    solid = np.flatnonzero(kind != PART_KINDS.index("mesh"))
+    image = cast(kind[solid], size[solid], T_camera_part[solid], *frame)
+    if len(solid) == len(kind):
+        return image
+    depth, part, facing = cast_meshes(meshes, T_camera_part, *frame)
+    solid_first = (image.part >= 0) & ((part < 0) | (image.depth <= depth))
+    of_solid = solid[image.part] if len(solid) else image.part
+    return Image(
+        np.where(solid_first, image.depth, depth),
+        np.where(solid_first, of_solid, part).astype(np.int32),
+        np.where(solid_first, image.facing, facing),
+    )

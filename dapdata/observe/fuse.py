@@ -67,19 +67,19 @@ def _no_planes(depth: Array, stride: int) -> Array:
     return planes
 
 
-def fuse(points: list[Array], normals: list[Array], T_world_camera: Array, voxel: float) -> Fused:
+def fuse(points: list[Array], normals: list[Array], T_world_view: Array, voxel: float) -> Fused:
     """One point per occupied voxel of edge `voxel` (m) from the (n, 3) f4 points and normals of V views.
 
     Args:
-        points, normals: One each a view, camera frame.
-        T_world_camera: (V, 4, 4).
+        points, normals: One each a view, in its own frame, such as its camera's.
+        T_world_view: (V, 4, 4).
         voxel: Edge, m.
     """
     n = sum(len(p) for p in points)
     # Made by numpy: its zeros cost nothing where they are not touched, and there are far fewer voxels than points.
     keys, sums, counts = np.zeros(n, np.int64), np.zeros((n, 6)), np.zeros((n, len(points)), np.int32)
     table, m = np.zeros(TABLE, np.int32), 0
-    for view, T in enumerate(T_world_camera):
+    for view, T in enumerate(T_world_view):
         m, table = _voxel_sums(points[view], normals[view], T, view, voxel, m, table, keys, sums, counts)
     return Fused(*_means(np.argsort(keys[:m]), sums, counts))
 

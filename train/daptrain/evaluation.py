@@ -202,8 +202,8 @@ def _predict_one(predictor: Predictor, sample: Sample, k: int, draws: int, rng: 
     found.placements[demo] = _placements(proposals, T_world_box @ T_box_object, scores)
     if draws > k:  # neither ranked nor judged, and so not on the clock
         more = predictor.propose(inputs, draws - k, rng, drawn=k)
-        T_world_box, scores = predictor.finish(more, *container, box)
-        found.placements[demo] += _placements(more, T_world_box @ T_box_object, scores)
+        T_world_box, scores = predictor.finish(proposals + more, *container, box)
+        found.placements[demo] += _placements(more, T_world_box[k:] @ T_box_object, scores[k:])
     found.prepare_s.append((ready - start) / k)
     found.infer_s.append((done - ready) / k)
     assert found.affordance is not None

@@ -35,7 +35,7 @@ from daptrain.fit import ContainerFit, ObjectFit, fit_container
 
 Array = NDArray[Any]
 
-STEPS = ("gravity", "yaw", "settle", "search")  # of refine, in this order; each can be left out
+STEPS = ("gravity", "yaw", "settle", "search", "spread")  # of refine, in this order; each can be left out
 CRITERIA = ("inside", "path", "support", "balance", "residual")  # of rank; each can be left out
 
 REACH = 0.016  # m: how far the search may shift a candidate sideways
@@ -56,6 +56,8 @@ LEAST_SUPPORT = 0.02  # share of the footprint: less is not told apart
 SUPPORT_COST = 3.0  # of support that is e times smaller, in mm of depth
 BALANCED = 0.7  # share of the smaller half extent: support that reaches this far all around is enough
 HERE = np.zeros((1, 2))  # m: no shift
+PLACE = 0.02  # m: candidates whose centres are nearer than this head for one place
+SPREAD = 0.003 * np.array([(0, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1), (1, 0, 0), (-1, 0, 0)])  # m, first to last
 BALANCE_COST = 6.0  # of a reach that is smaller by that half extent, in mm of depth
 
 
@@ -99,7 +101,8 @@ def refine(T_world_box: Array, scene: ObservedScene, fit: ObjectFit, steps: Coll
         fit: From `fit.fit_object`.
         steps: Which of STEPS to do: gravity (the upright axis becomes vertical), yaw (a box turns square to the
             container), settle (down or up onto the points under it), search (sideways, out of points that are in it or
-            in its way).
+            in its way), spread (a candidate for the place of one before it moves 3 mm aside, each in another direction:
+            the cameras' error is the same for all of them, so that trying the same spot again would fail again).
 
     Returns:
         (K, 4, 4) poses; candidates that are not finite come back as they are.
@@ -123,6 +126,8 @@ def refine(T_world_box: Array, scene: ObservedScene, fit: ObjectFit, steps: Coll
             T[k, :2, 3] += _search(T[k], near, fit)
             if "settle" in steps:  # on another spot it may stand on something else
                 T[k, 2, 3] += _settle(T[k], near, fit)
+    if "spread" in steps:
+        T[:, :3, 3] += _spread(T[:, :3, 3])
     out = np.asarray(T_world_box, float).copy()
     out[good] = scene.container.T_world_front @ T[good]
     return out
@@ -307,6 +312,13 @@ def _search(T: Array, scene: ObservedScene, fit: ObjectFit) -> Array:
         cost -= SUPPORT_COST * np.log(_supported(T, scene, fit, shifts))
         best, reach = shifts[np.argmin(cost)], grid / 2
     return np.asarray(best)
+
+
+def _spread(centres: Array) -> Array:
+    """(K, 3) shifts along x, y and z of the front frame, m, that keep candidates (K, 3) for one place apart."""
+    apart = np.linalg.norm(centres[:, None] - centres[None], axis=2)
+    earlier = np.tril(apart < PLACE, -1).sum(axis=1)
+    return np.asarray(SPREAD[earlier % len(SPREAD)])
 
 
 def _depth(T: Array, scene: ObservedScene, fit: ObjectFit, shifts: Array) -> Array:

@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dapdata import meshes
 from dapdata.poses import inverse, pose, rotation_about
-from dapdata.records import Placement
-from dapdata.solids import points_on_faces, upward_faces
+from dapdata.records import Placement, meshes_in
+from dapdata.solids import Faces, points_on_faces, upward_faces
 from daptrain.baselines.random import interior
 from daptrain.fit import ObjectFit, fit_object
 from daptrain.refine import CRITERIA, STEPS, observed_scene, rank, rank_collision_count, refine
@@ -61,9 +62,17 @@ def place(
     return [Placement(T, float(score), "ok") for T, score in zip(T_world_object, scores)]
 
 
+def surfaces(sample: dict[str, Array]) -> Faces:
+    """The true horizontal faces of container and clutter, of solids and of meshes, container frame."""
+    T_container_part = sample["scene/T_container_part"]
+    flat = upward_faces(sample["scene/kind"], sample["scene/size"], T_container_part)
+    rough = meshes.upward_faces(meshes_in(sample)[0], T_container_part)
+    return Faces(**{name: np.concatenate([getattr(flat, name), getattr(rough, name)]) for name in vars(flat)})
+
+
 def propose(sample: dict[str, Array], fit: ObjectFit, k: int, rng: np.random.Generator) -> Array:
     """(K, 4, 4) upright poses of the fitted object, square to the container, on its true surfaces; K is k or 0."""
-    faces = upward_faces(sample["scene/kind"], sample["scene/size"], sample["scene/T_container_part"])
+    faces = surfaces(sample)
     if len(faces.area) == 0:
         return np.zeros((0, 4, 4))
     centres = points_on_faces(faces, TRIES * k, rng) + np.array([0, 0, fit.size[2] / 2 + ABOVE])

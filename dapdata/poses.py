@@ -48,10 +48,14 @@ def rotate(T_a_b: Array, vectors_b: Array) -> Array:
     return np.asarray(vectors_b @ T_a_b[:3, :3].T)
 
 
+def skew(x: float, y: float, z: float) -> Array:
+    """(3, 3) matrix that makes the cross product of (x, y, z) with a vector."""
+    return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+
+
 def rotation_about(axis: Array | tuple[float, float, float], angle: float) -> Array:
     """(3, 3) rotation by angle (rad) about an axis of any length but zero (Rodrigues)."""
-    x, y, z = np.asarray(axis, float) / np.linalg.norm(axis)
-    K = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    K = skew(*np.asarray(axis, float) / np.linalg.norm(axis))
     return np.asarray(np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * K @ K)
 
 
@@ -113,8 +117,8 @@ def nearest_symmetric(T_a_object: Array, T_a_reference: Array, kind: str, axis: 
     if axis_a @ axis_ref < 0:
         axis_a = -axis_a
     # Turn the reference by the smallest rotation that brings its axis onto ours.
-    cross, cosine = np.cross(axis_ref, axis_a), axis_ref @ axis_a
-    K = np.array([[0, -cross[2], cross[1]], [cross[2], 0, -cross[0]], [-cross[1], cross[0], 0]])
+    (a, b, c), (x, y, z), cosine = axis_ref.tolist(), axis_a.tolist(), axis_ref @ axis_a
+    K = skew(b * z - c * y, c * x - a * z, a * y - b * x)
     return pose((np.eye(3) + K + K @ K / (1 + cosine)) @ R_ref, T_a_object[:3, 3])
 
 

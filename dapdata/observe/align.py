@@ -17,7 +17,7 @@ import numpy as np
 from numba import njit
 
 from dapdata.observe.cameras import View
-from dapdata.poses import pose, rotation_by
+from dapdata.poses import pose, rotation_by, skew
 from dapdata.records import Array
 
 IMAGE_ROWS = 240  # partners are sought in images of about this height: of larger ones every 4th, 9th, ... point is taken
@@ -67,9 +67,8 @@ def _prior(T_world_camera: Array) -> Array:
     """(6 V, 6 V) inverse covariance of the motions (shift, turn) in the world frame, which all are zero on average."""
     out = np.zeros((len(T_world_camera), 6, len(T_world_camera), 6))
     for v, T in enumerate(T_world_camera):
-        x, y, z = T[:3, 3]
         own = np.eye(6)  # of the camera: it is shifted by a turn about the world's origin, too
-        own[:3, 3:] = [[0, z, -y], [-z, 0, x], [y, -x, 0]]
+        own[:3, 3:] = -skew(*T[:3, 3])
         out[v, :, v] = own.T @ np.diag([TRANSLATION**-2] * 3 + [ROTATION**-2] * 3) @ own
     return out.reshape(6 * len(T_world_camera), -1)
 

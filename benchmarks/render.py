@@ -1,7 +1,7 @@
 """One depth and segmentation image of a shelf of 100 parts: our ray caster against PyBullet's TinyRenderer and Open3D.
 
 Rivals get their scene built beforehand and return less: TinyRenderer no incidence and a raw depth buffer, Open3D
-a distance along the ray. Ours packs the scene and returns metres, part ids and normals in each call. Pixels where
+a distance along the ray. Ours packs the scene and returns metres, part ids and incidence in each call. Pixels where
 depths differ by more than 5 mm are counted (at silhouettes), so that all are seen to draw the same picture.
 """
 

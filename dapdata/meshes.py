@@ -427,8 +427,8 @@ def cast(
     """What a perfect depth camera sees of the parts that are meshes; see observe.raycast.cast.
 
     Returns:
-        (H, W) f4 depth, m, 0 where nothing is seen; (H, W) i4 row of the part, -1 where nothing is; (H, W, 3) f4 unit
-        normals toward the camera.
+        (H, W) f4 depth, m, 0 where nothing is seen; (H, W) i4 row of the part, -1 where nothing is; (H, W) f4 cosine of
+        the angle between the ray and the surface's normal, 0 where nothing is.
     """
     rows = [p for p, mesh in enumerate(meshes) if mesh is not None]
     seen = [Mesh(transform(T_camera_part[p], m.vertices), m.faces) for p in rows if (m := meshes[p]) is not None]
@@ -439,12 +439,12 @@ def cast(
     missed = ~(depth <= far)
     starts = np.cumsum([0, *(len(mesh.faces) for mesh in seen)])
     normal = np.concatenate([normals(mesh) for mesh in seen])[np.where(missed, 0, starts[which] + face)]
-    normal *= np.where(np.einsum("hwk,hwk->hw", normal, rays) > 0, -1, 1)[..., None]
+    facing = np.abs(np.einsum("hwk,hwk->hw", normal, rays)) / np.linalg.norm(rays, axis=-1)
     part = np.where(missed, -1, np.array(rows)[which])
     return (
         np.where(missed, 0, depth).astype(np.float32),
         part.astype(np.int32),
-        np.where(missed[..., None], 0, normal).astype(np.float32),
+        np.where(missed, 0, facing).astype(np.float32),
     )
 
 

@@ -78,8 +78,8 @@ def _label(made: Inputs, sections: Sections, draw: Draw) -> Labels:
 
 
 STAGES = (
-    Stage("demonstrate", 2, ("scene", "placement"), (), Demo, _demonstrate, packages=("pybullet", "numpy"), attempts=50),
-    Stage("observe", 2, ("cameras", "noise"), ("demonstrate",), Cloud, _observe, packages=("numba", "numpy")),
+    Stage("demonstrate", 3, ("scene", "placement"), (), Demo, _demonstrate, packages=("pybullet", "numpy"), attempts=50),
+    Stage("observe", 3, ("cameras", "noise"), ("demonstrate",), Cloud, _observe, packages=("numba", "numpy")),
     Stage("cluster", 1, ("superpoints",), ("observe",), Superpoints, _cluster, packages=("numba", "numpy")),
     Stage("label", 1, ("label",), ("demonstrate", "observe", "cluster"), Labels, _label, packages=("numpy",), is_shard=True),
 )

@@ -10,6 +10,7 @@ Symmetry kinds (`records.SYMMETRIES`), each a group acting on the object frame f
 
 from __future__ import annotations
 
+from math import cos, hypot, sin
 from typing import Any
 
 import numpy as np
@@ -20,10 +21,10 @@ Array = NDArray[Any]
 
 def pose(rotation: Array | None = None, translation: Array | tuple[float, float, float] = (0, 0, 0)) -> Array:
     """(4, 4) pose of a (3, 3) rotation (default: none) and a (3,) translation, m."""
-    T = np.eye(4)
-    if rotation is not None:
-        T[:3, :3] = rotation
+    T = np.zeros((4, 4))
+    T[:3, :3] = np.eye(3) if rotation is None else rotation
     T[:3, 3] = translation
+    T[3, 3] = 1
     return T
 
 
@@ -47,17 +48,29 @@ def rotate(T_a_b: Array, vectors_b: Array) -> Array:
     return np.asarray(vectors_b @ T_a_b[:3, :3].T)
 
 
+def skew(x: float, y: float, z: float) -> Array:
+    """(3, 3) matrix that makes the cross product of (x, y, z) with a vector."""
+    return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+
+
 def rotation_about(axis: Array | tuple[float, float, float], angle: float) -> Array:
     """(3, 3) rotation by angle (rad) about an axis of any length but zero (Rodrigues)."""
-    x, y, z = np.asarray(axis, float) / np.linalg.norm(axis)
-    K = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    K = skew(*np.asarray(axis, float) / np.linalg.norm(axis))
     return np.asarray(np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * K @ K)
 
 
 def rotation_by(turn: Array) -> Array:
     """(3, 3) rotation by a rotation vector (3,): about its direction, by its length in rad; zero turns nothing."""
-    angle = float(np.linalg.norm(turn))
-    return rotation_about(turn, angle) if angle > 0 else np.eye(3)
+    x, y, z = (float(value) for value in turn)
+    angle = hypot(x, y, z)
+    s, c = (sin(angle) / angle, (1 - cos(angle)) / angle**2) if angle > 0 else (1.0, 0.5)
+    return np.array(
+        [
+            [1 - c * (y * y + z * z), c * x * y - s * z, c * x * z + s * y],
+            [c * x * y + s * z, 1 - c * (x * x + z * z), c * y * z - s * x],
+            [c * x * z - s * y, c * y * z + s * x, 1 - c * (x * x + y * y)],
+        ]
+    )
 
 
 def random_rotation(rng: np.random.Generator) -> Array:
@@ -104,8 +117,8 @@ def nearest_symmetric(T_a_object: Array, T_a_reference: Array, kind: str, axis: 
     if axis_a @ axis_ref < 0:
         axis_a = -axis_a
     # Turn the reference by the smallest rotation that brings its axis onto ours.
-    cross, cosine = np.cross(axis_ref, axis_a), axis_ref @ axis_a
-    K = np.array([[0, -cross[2], cross[1]], [cross[2], 0, -cross[0]], [-cross[1], cross[0], 0]])
+    (a, b, c), (x, y, z), cosine = axis_ref.tolist(), axis_a.tolist(), axis_ref @ axis_a
+    K = skew(b * z - c * y, c * x - a * z, a * y - b * x)
     return pose((np.eye(3) + K + K @ K / (1 + cosine)) @ R_ref, T_a_object[:3, 3])
 
 

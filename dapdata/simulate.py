@@ -66,7 +66,7 @@ TOUCH = 0.001  # m: closer than this is a contact; resting bodies are within 0.0
 SUPPORTING = 0.5  # cosine: a contact holds up if its normal is within 60 degrees of up
 RIM = 0.002  # m: an object in a container that opens upwards reaches at least so far below its top
 GAP_RANGE = 0.05  # m: gaps under an object are looked for this far
-MAX_PARTS = 16  # of an object: PyBullet makes no shape of more, and says nothing
+MAX_PARTS = 16  # of a body: PyBullet makes no shape of more, and says nothing
 HANG_SECONDS = 1.0  # s until a mug that was put onto a peg hangs still; most do after 0.4
 HANG_SHIFT = 0.1  # m: one that came further has fallen off
 HANG_ROLLING = 0.001  # rolling and spinning friction of what hangs: without it, mugs jitter on a peg at up to 9 mm/s
@@ -551,14 +551,15 @@ class _World:
             _check_parts(name, found, *arrays)
         self._T_object_body = _object_body(self._object, self._object_meshes)
         self._bounds = _bounds(parts, part_meshes)  # (P, 2, 3)
+        self._bounds_at: dict[bytes, Array] = {}  # of the object, by its pose
         container = self._bounds[np.asarray(scene.part_role) == ROLES.index("container")]
         self._inside = np.stack([container[:, 0].min(axis=0), container[:, 1].max(axis=0)])
         self._bullet, self._client = _client(os.getpid())
         self._start()
-        self._parts = [
-            self._body(0.0, T, self._shape(int(kind), size, mesh), mesh is not None)
-            for kind, size, T, mesh in zip(*parts, part_meshes)
-        ]
+        self._body_of_part = np.zeros(len(parts[0]), np.int64)
+        low, high = self._object_bounds(np.eye(4))
+        for shared in _shared_bodies(parts[0], self._bounds, float(np.linalg.norm(high - low))):
+            self._body_of_part[shared] = self._fixed(*(x[shared] for x in parts), part_meshes[shared[0]])
         self._probe = self._copy(0.0, np.eye(4))
         self._bullet.setCollisionFilterGroupMask(self._probe, -1, 0, 0, physicsClientId=self._client)
 
@@ -589,6 +590,12 @@ class _World:
             rolling = {"rollingFriction": HANG_ROLLING, "spinningFriction": HANG_ROLLING}
             b.changeDynamics(body, -1, **rolling, physicsClientId=self._client)
         return body
+
+    def _fixed(self, kind: Array, size: Array, T: Array, mesh: Mesh | None) -> int:
+        """A fixed body of one part, or of several boxes and cylinders."""
+        if len(kind) == 1:
+            return self._body(0.0, T[0], self._shape(int(kind[0]), size[0], mesh), mesh is not None)
+        return self._body(0.0, pose(), self._compound(kind, size, T, ()), is_mesh=False)
 
     def _copy(self, mass: float, T: Array) -> int:
         """A copy of the object at T."""
@@ -670,14 +677,14 @@ class _World:
             yield int(step), self._measure(_moved(T, offsets[step]), parts[meet[step]], 0.0)
 
     def _measure(self, T: Array, parts: Array, reach: float) -> list[_Contact]:
-        """Contacts of the held object at T with the given parts."""
+        """Contacts of the held object at T with the given parts, and with others of their bodies that are as close."""
         b, client = self._bullet, self._client
         if not len(parts):
             return []
         b.resetBasePositionAndOrientation(self._probe, *_to_bullet(T @ self._T_object_body), physicsClientId=client)
         found = []
-        for p in parts:
-            for point in b.getClosestPoints(self._probe, self._parts[p], reach, physicsClientId=client):
+        for body in np.unique(self._body_of_part[parts]).tolist():
+            for point in b.getClosestPoints(self._probe, body, reach, physicsClientId=client):
                 found.append(_Contact(point[8], np.array(point[7]), point[6][2]))
         return found
 
@@ -735,10 +742,13 @@ class _World:
         return tilt(T, self.symmetry, self._axis)
 
     def _object_bounds(self, T: Array) -> Array:
-        """(2, 3) low and high corner of the object's bounding box at T."""
-        kind, size, T_object_part = self._object
-        each = _bounds((kind, size, T @ T_object_part), self._object_meshes)
-        return np.stack([each[:, 0].min(axis=0), each[:, 1].max(axis=0)])
+        """(2, 3) low and high corner of the object's bounding box at T; each pose is asked for several times."""
+        found = self._bounds_at.get(T.tobytes())
+        if found is None:
+            kind, size, T_object_part = self._object
+            each = _bounds((kind, size, T @ T_object_part), self._object_meshes)
+            found = self._bounds_at[T.tobytes()] = np.stack([each[:, 0].min(axis=0), each[:, 1].max(axis=0)])
+        return found
 
     # Copies that fall
 
@@ -823,6 +833,33 @@ def _check_parts(name: str, found: Sequence[Mesh | None], kind: Array, size: Arr
         raise UsageError(f"{name}: got {len(kind)}, expected {MAX_PARTS} at the most; build the object from fewer")
     if not (np.all(np.isfinite(T)) and np.all(np.isfinite(size)) and np.all(size > 0)):
         raise UsageError(f"{name}: got sizes or poses that are not finite or not positive, expected metres; correct the scene")
+
+
+def _shared_bodies(kind: Array, bounds: Array, reach: float) -> list[list[int]]:
+    """Indices of the parts that make one fixed body each, since a body costs much more than another solid in it.
+
+    Parts that one object can touch at once are in different bodies. PyBullet sorts contacts by pairs of bodies, and leaves
+    those of one pair in an order on which other copies of the object have an influence.
+
+    Args:
+        kind: (P,) kinds of the parts. All but boxes and cylinders stay alone: PyBullet has no compounds of them.
+        bounds: (P, 2, 3) their bounding boxes, m.
+        reach: Diameter of the object, m.
+    """
+    low, high = bounds[:, 0], bounds[:, 1]
+    gap = np.maximum(low[:, None] - high, 0) + np.maximum(low - high[:, None], 0)
+    near = np.linalg.norm(gap, axis=2) <= reach
+    can_share = np.isin(kind, (solids.BOX, solids.CYLINDER))
+    bodies: list[list[int]] = []
+    taken: list[Array] = []  # (P,) of each body: the parts that are near one of its own
+    for part in np.flatnonzero(can_share).tolist():
+        body = next((i for i, of_body in enumerate(taken) if not of_body[part] and len(bodies[i]) < MAX_PARTS), len(bodies))
+        if body == len(bodies):
+            bodies.append([])
+            taken.append(np.zeros(len(kind), bool))
+        bodies[body].append(part)
+        taken[body] |= near[part]
+    return bodies + [[part] for part in np.flatnonzero(~can_share).tolist()]
 
 
 @cache

@@ -89,19 +89,20 @@ def observe_with_truth(demo: Demo, cameras, noise, rng):
     from dapdata.observe.fuse import fuse, view_cloud
     from dapdata.observe.noise import add_noise
     from dapdata.observe.raycast import cast
-    from dapdata.poses import inverse
+    from dapdata.poses import inverse, rotate, transform
 
-    points, normals, truth = [], [], []
-    for view in container_views(demo, cameras, noise, rng):
+    points, normals, truth, views = [], [], [], container_views(demo, cameras, noise, rng)
+    for view in views:
         T_camera_part = inverse(view.T_world_camera_true) @ demo.T_world_container @ demo.T_container_part
         image = cast(demo.part_kind, demo.part_size, T_camera_part, view.K, view.width, view.height)
         p, n = view_cloud(add_noise(image, view.K, noise.preset, view.noise_seed), view)
-        in_camera = (p - view.T_world_camera[:3, 3]) @ view.T_world_camera[:3, :3]
-        u, v = np.floor((in_camera @ view.K.T)[:, :2] / in_camera[:, 2:]).astype(int).T
+        u, v = np.floor((p @ view.K.T)[:, :2] / p[:, 2:]).astype(int).T
         points, normals = [*points, p], [*normals, n]
-        truth.append(image.normal[v, u] @ view.T_world_camera_true[:3, :3].T)
-    fused = fuse(points, normals, cameras.container_voxel)
-    cell = np.floor(np.concatenate(points).astype(float) / cameras.container_voxel)
+        truth.append(true_normals(demo, image, T_camera_part, view.K)[v, u] @ view.T_world_camera_true[:3, :3].T)
+    T = np.stack([view.T_world_camera for view in views])
+    fused = fuse(points, normals, T, cameras.container_voxel)
+    points, normals = [transform(t, p) for t, p in zip(T, points)], [rotate(t, n) for t, n in zip(T, normals)]
+    cell = np.floor(np.concatenate(points) * (1 / cameras.container_voxel))
     _, voxel, size = np.unique(cell, axis=0, return_inverse=True, return_counts=True)
 
     def mean(a):
@@ -109,6 +110,22 @@ def observe_with_truth(demo: Demo, cameras, noise, rng):
 
     agree = np.linalg.norm(mean(np.concatenate(normals)), axis=1) > 0.1
     return fused.points, fused.normals, mean(np.concatenate(truth))[agree]
+
+
+def true_normals(demo: Demo, image, T_camera_part, K):
+    """(H, W, 3) outward normals, camera frame, of boxes and upright cylinders where an image sees them; zeros elsewhere."""
+    v, u = np.mgrid[: len(image.depth), : image.depth.shape[1]] + 0.5
+    seen = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones_like(u)], axis=-1) * image.depth[..., None]
+    out = np.zeros_like(seen)
+    for p, (kind, half, T) in enumerate(zip(demo.part_kind, demo.part_size / 2, T_camera_part)):
+        local = (seen[image.part == p] - T[:3, 3]) @ T[:3, :3]
+        faces = np.eye(3)[np.abs(np.abs(local) - half).argmin(axis=1)] * np.sign(local)
+        if kind != BOX:
+            round_ = local * [1, 1, 0] / np.maximum(np.linalg.norm(local[:, :2], axis=1, keepdims=True), 1e-12)
+            on_mantle = half[0] - np.linalg.norm(local[:, :2], axis=1) < half[2] - np.abs(local[:, 2])
+            faces = np.where(on_mantle[:, None], round_, [0, 0, 1] * np.sign(local))
+        out[image.part == p] = faces @ T[:3, :3].T
+    return out
 
 
 def purity(superpoint, true_normals):

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from dapdata.config import RpdiffConfig
 from dapdata.interop.rpdiff_files import Bodies, Fault, Raw, check, on_table, own, read_fields, rejected
 from dapdata.observe import CamerasConfig
-from dapdata.poses import inverse, transform
+from dapdata.poses import inverse, pose, rotate, transform
 from dapdata.records import Cloud, Demo, Rejected
 
 Array = NDArray[Any]
@@ -74,8 +74,8 @@ def _fused(points: Array, normals: Array | None, raw: Raw, config: RpdiffConfig,
     views = _depth_views(points, raw, config)
     if views is None:
         views = _by_camera(points, normals, raw)
-    down = np.array([0, 0, config.table_height])
-    fused = fuse([(p - down).astype(np.float32) for p, _ in views], [n.astype(np.float32) for _, n in views], voxel)
+    T_table = np.tile(pose(None, (0, 0, -config.table_height)), (len(views), 1, 1))
+    fused = fuse([p.astype(np.float32) for p, _ in views], [n.astype(np.float32) for _, n in views], T_table, voxel)
     return fused.points, fused.normals, fused.view
 
 
@@ -106,7 +106,8 @@ def _depth_views(points: Array, raw: Raw, config: RpdiffConfig) -> list[tuple[Ar
         np.minimum.at(depth, (pixel[:, 1], pixel[:, 0]), z[owner == v].astype(np.float32))
         # Our pixels are seen through their centres: with the camera as it is, points from corners move there.
         moved = K + HALF_PIXEL if corner == 0 and not config.half_pixel else K
-        views.append(view_cloud(np.where(np.isfinite(depth), depth, 0), View(width, height, moved, T, T, 0)))
+        near, normals = view_cloud(np.where(np.isfinite(depth), depth, 0), View(width, height, moved, T, T, 0))
+        views.append((transform(T, near), rotate(T, normals)))
     return views
 
 

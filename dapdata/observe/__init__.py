@@ -122,7 +122,7 @@ def _look(
     from dapdata.observe.align import align
     from dapdata.observe.fuse import fuse, view_cloud
     from dapdata.observe.noise import add_noise
-    from dapdata.poses import inverse, rotate, transform
+    from dapdata.poses import inverse
 
     clouds = []
     for view in views:
@@ -133,11 +133,7 @@ def _look(
     T_world_camera = np.stack([view.T_world_camera for view in views])
     if cameras.align and len(views) > 1:
         T_world_camera = align(views, points, normals)
-        for v, view in enumerate(views):
-            T_aligned_world = T_world_camera[v] @ inverse(view.T_world_camera)
-            points[v] = transform(T_aligned_world, points[v]).astype(np.float32)
-            normals[v] = rotate(T_aligned_world, normals[v]).astype(np.float32)
-    return fuse(points, normals, voxel), T_world_camera
+    return fuse(points, normals, T_world_camera, voxel), T_world_camera
 
 
 def _image(
@@ -152,11 +148,11 @@ def _image(
     image = cast(kind[solid], size[solid], T_camera_part[solid], *frame)
     if len(solid) == len(kind):
         return image
-    depth, part, normal = cast_meshes(meshes, T_camera_part, *frame)
+    depth, part, facing = cast_meshes(meshes, T_camera_part, *frame)
     solid_first = (image.part >= 0) & ((part < 0) | (image.depth <= depth))
     of_solid = solid[image.part] if len(solid) else image.part
     return Image(
         np.where(solid_first, image.depth, depth),
         np.where(solid_first, of_solid, part).astype(np.int32),
-        np.where(solid_first[..., None], image.normal, normal),
+        np.where(solid_first, image.facing, facing),
     )

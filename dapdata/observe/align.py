@@ -4,20 +4,20 @@ A calibrated rig knows each camera's pose to some millimetres and tenths of a de
 sides of a narrow gap, seen by different cameras, up to a centimetre apart. Where two views see the same surface they say
 so themselves. What they cannot tell, an error that all views share above all, stays as it was believed.
 
-Each view gets a small motion of its camera. All of them are found together by Gauss-Newton: a point of one view, projected
-into another, should lie on the plane of the point that this one sees there; and a correction is unlikely to be larger than
-calibrations are wrong. Projection finds partners in constant time, and is sure to, since poses are nearly right.
+Each view gets a small motion. All of them are found together by Gauss-Newton: a point of one view, projected into another,
+should lie on the plane of the point that this one sees there; and a correction is unlikely to be larger than calibrations
+are wrong. Projection finds partners in constant time, and is sure to, since poses are nearly right. Motions are expressed in
+the world frame, where the two views of a pair move their points apart by the difference of their motions: six numbers say
+what a pair of points wants of twelve unknowns.
 """
 
 from __future__ import annotations
-
-from itertools import permutations
 
 import numpy as np
 from numba import njit
 
 from dapdata.observe.cameras import View
-from dapdata.poses import inverse, pose, rotate, rotation_by, transform
+from dapdata.poses import pose, rotation_by, skew
 from dapdata.records import Array
 
 IMAGE_ROWS = 240  # partners are sought in images of about this height: of larger ones every 4th, 9th, ... point is taken
@@ -35,110 +35,144 @@ def align(views: list[View], points: list[Array], normals: list[Array]) -> Array
     """(V, 4, 4) T_world_camera of each view, corrected.
 
     Args:
-        views: V cameras, with the poses that are believed.
-        points: (n, 3) of each view, world frame, m, by the believed poses.
-        normals: (n, 3) unit.
+        views: V cameras of one image size, with the poses that are believed.
+        points: (n, 3) f4 of each view, its camera's frame, m.
+        normals: (n, 3) f4 unit, the same.
     """
     T = np.stack([view.T_world_camera for view in views])
-    strides = [max(1, round(view.height / IMAGE_ROWS)) for view in views]
-    local = [transform(inverse(T[v]), p[:: strides[v] ** 2].astype(float)) for v, p in enumerate(points)]
-    facing = [rotate(inverse(T[v]), n[:: strides[v] ** 2].astype(float)) for v, n in enumerate(normals)]
+    stride = max(1, round(views[0].height / IMAGE_ROWS))
+    local, facing = [p[:: stride**2] for p in points], [n[:: stride**2] for n in normals]
+    start = np.cumsum([0, *map(len, local)])
+    K = np.stack([view.K for view in views]) / [[stride], [stride], [1]]
+    rows = np.full((len(views), -(-views[0].height // stride), -(-views[0].width // stride)), -1, np.int32)
+    for v, p in enumerate(local):
+        _enter(p, start[v], K[v], rows[v])
     few = [np.unique(np.linspace(0, len(p) - 1, min(len(p), SAMPLES)).astype(int)) for p in local]
-    seekers = [(p[chosen], n[chosen]) for p, n, chosen in zip(local, facing, few)]
-    K = [view.K / [[stride], [stride], [1]] for view, stride in zip(views, strides)]
-    rows = [_rows(p, K[v], -(-views[v].height // strides[v]), -(-views[v].width // strides[v])) for v, p in enumerate(local)]
-    prior = np.tile([TRANSLATION**-2] * 3 + [ROTATION**-2] * 3, len(views))
-    moved = np.zeros(6 * len(views))  # sum of the steps: they are small enough to add up
+    seekers, seeker_start = np.concatenate(few) + np.repeat(start[:-1], [*map(len, few)]), np.cumsum([0, *map(len, few)])
+    clouds = (np.concatenate(local), np.concatenate(facing), seekers, seeker_start, rows, K)
+    prior, moved = _prior(T), np.zeros(6 * len(views))  # moved: sum of the steps, small enough to add up
     for iteration in range(ROUNDS):
-        H, g = np.diag(prior), -prior * moved
-        gate = GATES[min(iteration // 2, 1)]
-        for a, b in permutations(range(len(views)), 2):
-            _add_pair(*seekers[a], local[b], facing[b], rows[b], K[b], inverse(T[b]) @ T[a], a, b, gate, H, g)
+        H, g = prior.copy(), -prior @ moved
+        _add_pairs(T, *clouds, GATES[min(iteration // 2, 1)], H, g)
         step = np.linalg.solve(H, g)
         moved += step
-        for v in range(len(views)):
-            shift, turn = step[6 * v : 6 * v + 3], step[6 * v + 3 : 6 * v + 6]
-            T[v] = T[v] @ pose(rotation_by(turn), shift)
+        for v, (shift, turn) in enumerate(step.reshape(-1, 2, 3)):
+            T[v] = pose(rotation_by(turn), shift) @ T[v]
         if np.abs(step).max() < CONVERGED:
             break
     return T
 
 
-def _rows(points: Array, K: Array, height: int, width: int) -> Array:
-    """(H, W) i4: one of the points (n, 3), camera frame, that each pixel of a camera (3, 3) sees; -1 for none."""
-    rows = np.full((height, width), -1, np.int32)
-    if len(points):
-        u, v = (np.floor(K[k, k] * points[:, k] / points[:, 2] + K[k, 2]).astype(int) for k in (0, 1))
-        u, v = np.clip(u, 0, width - 1), np.clip(v, 0, height - 1)  # an outermost pixel may round outwards
-        rows[v, u] = np.arange(len(points))
-    return rows
+def _prior(T_world_camera: Array) -> Array:
+    """(6 V, 6 V) inverse covariance of the motions (shift, turn) in the world frame, which all are zero on average."""
+    out = np.zeros((len(T_world_camera), 6, len(T_world_camera), 6))
+    for v, T in enumerate(T_world_camera):
+        own = np.eye(6)  # of the camera: it is shifted by a turn about the world's origin, too
+        own[:3, 3:] = -skew(*T[:3, 3])
+        out[v, :, v] = own.T @ np.diag([TRANSLATION**-2] * 3 + [ROTATION**-2] * 3) @ own
+    return out.reshape(6 * len(T_world_camera), -1)
 
 
-@njit(cache=True)
-def _add_pair(
+@njit(cache=True, error_model="numpy")
+def _enter(points: Array, first: int, K: Array, rows: Array) -> None:
+    """Write into rows (H, W) which of the points (n, 3), camera frame, counted from `first`, each pixel of a camera sees."""
+    for i in range(len(points)):
+        u = int(np.floor(K[0, 0] * points[i, 0] / points[i, 2] + K[0, 2]))
+        v = int(np.floor(K[1, 1] * points[i, 1] / points[i, 2] + K[1, 2]))
+        # An outermost pixel may round outwards.
+        rows[min(max(v, 0), rows.shape[0] - 1), min(max(u, 0), rows.shape[1] - 1)] = first + i
+
+
+@njit(cache=True, error_model="numpy")
+def _add_pairs(
+    T_world_camera: Array,
     points: Array,
     normals: Array,
-    other_points: Array,
-    other_normals: Array,
+    seekers: Array,
+    seeker_start: Array,
     rows: Array,
     K: Array,
-    T_other_own: Array,
-    own: int,
-    other: int,
     gate: float,
     H: Array,
     g: Array,
 ) -> None:
-    """Add to the normal equations what the points of one view say in another.
+    """Add to the normal equations H step = g what the points of each view a say in each other view b.
 
     Args:
-        points, normals: (s, 3) of the one view, its camera's frame.
-        other_points, other_normals: (n, 3) of the other view, its camera's frame.
-        rows: (H, W) points of the other view by pixel, -1 for none.
-        K: (3, 3) of the other camera, px.
-        T_other_own: (4, 4) between the cameras, as corrected so far.
-        own, other: Numbers of the two views.
+        T_world_camera: (V, 4, 4), as corrected so far.
+        points, normals: (N, 3) of all views, each in its camera's frame.
+        seekers, seeker_start: Rows of points that look for partners; those of view v are seeker_start[v] to [v + 1].
+        rows: (V, H, W) point that a pixel of each view sees, -1 for none.
+        K: (V, 3, 3) px.
         gate: m, partners that are farther apart are none.
-        H: (6 V, 6 V), symmetric; g: (6 V,). A view's unknowns are shift (m) and turn (rad) in its camera's frame.
+        H: (6 V, 6 V), symmetric; g: (6 V,). A view's unknowns are shift (m) and turn (rad) in the world frame.
+    """
+    J, sums = np.zeros(7), np.zeros((6, 7))
+    for a in range(len(rows)):
+        few = seekers[seeker_start[a] : seeker_start[a + 1]]
+        for b in range(len(rows)):
+            if a == b:
+                continue
+            sums[:] = 0
+            _sum_pair(T_world_camera[a], T_world_camera[b], points, normals, few, rows[b], K[b], gate, J, sums)
+            for i in range(6):
+                g[6 * a + i] -= sums[i, 6]
+                g[6 * b + i] += sums[i, 6]
+                for k in range(6):
+                    H[6 * a + i, 6 * a + k] += sums[i, k]
+                    H[6 * b + i, 6 * b + k] += sums[i, k]
+                    H[6 * a + i, 6 * b + k] -= sums[i, k]
+                    H[6 * b + i, 6 * a + k] -= sums[i, k]
+
+
+@njit(cache=True, error_model="numpy")
+def _sum_pair(
+    A: Array, B: Array, points: Array, normals: Array, seekers: Array, rows: Array, K: Array, gate: float, J: Array, sums: Array
+) -> None:
+    """Add to sums (6, 7) the products of each residual's derivatives J by a's motion with each other and with it.
+
+    A and B are the poses of the two views, J is (7,) to work in, the others are as in `_add_pairs`.
     """
     height, width = rows.shape
-    R, t = T_other_own[:3, :3], T_other_own[:3, 3]
-    J = np.zeros(12)
-    place = np.zeros(12, np.int64)
-    for k in range(6):
-        place[k], place[6 + k] = 6 * own + k, 6 * other + k
-    p, m = np.zeros(3), np.zeros(3)
-    for i in range(len(points)):
-        for k in range(3):
-            p[k] = R[k, 0] * points[i, 0] + R[k, 1] * points[i, 1] + R[k, 2] * points[i, 2] + t[k]
-            m[k] = R[k, 0] * normals[i, 0] + R[k, 1] * normals[i, 1] + R[k, 2] * normals[i, 2]
-        if p[2] <= 0:
+    for i in seekers:
+        x, y, z = float(points[i, 0]), float(points[i, 1]), float(points[i, 2])
+        px = A[0, 0] * x + A[0, 1] * y + A[0, 2] * z + A[0, 3]
+        py = A[1, 0] * x + A[1, 1] * y + A[1, 2] * z + A[1, 3]
+        pz = A[2, 0] * x + A[2, 1] * y + A[2, 2] * z + A[2, 3]
+        x, y, z = px - B[0, 3], py - B[1, 3], pz - B[2, 3]
+        x, y, z = (
+            B[0, 0] * x + B[1, 0] * y + B[2, 0] * z,
+            B[0, 1] * x + B[1, 1] * y + B[2, 1] * z,
+            B[0, 2] * x + B[1, 2] * y + B[2, 2] * z,
+        )
+        if z <= 0:
             continue
-        u, v = int(np.floor(K[0, 0] * p[0] / p[2] + K[0, 2])), int(np.floor(K[1, 1] * p[1] / p[2] + K[1, 2]))
+        u, v = int(np.floor(K[0, 0] * x / z + K[0, 2])), int(np.floor(K[1, 1] * y / z + K[1, 2]))
         if not (0 <= u < width and 0 <= v < height) or rows[v, u] < 0:
             continue
         j = rows[v, u]
-        x, y, z = p[0] - other_points[j, 0], p[1] - other_points[j, 1], p[2] - other_points[j, 2]
-        nx, ny, nz = other_normals[j, 0], other_normals[j, 1], other_normals[j, 2]
-        if x * x + y * y + z * z > gate * gate or m[0] * nx + m[1] * ny + m[2] * nz < SAME_SIDE:
+        x, y, z = x - points[j, 0], y - points[j, 1], z - points[j, 2]
+        if x * x + y * y + z * z > gate * gate:
             continue
+        nx, ny, nz = float(normals[j, 0]), float(normals[j, 1]), float(normals[j, 2])
         residual = nx * x + ny * y + nz * z
-        weight = 1 / (RESIDUAL * RESIDUAL * max(1.0, abs(residual) / HUBER))
-        # The point moves with its own camera: by R (shift + turn x point).
-        ox, oy, oz = (
-            R[0, 0] * nx + R[1, 0] * ny + R[2, 0] * nz,
-            R[0, 1] * nx + R[1, 1] * ny + R[2, 1] * nz,
-            R[0, 2] * nx + R[1, 2] * ny + R[2, 2] * nz,
+        nx, ny, nz = (
+            B[0, 0] * nx + B[0, 1] * ny + B[0, 2] * nz,
+            B[1, 0] * nx + B[1, 1] * ny + B[1, 2] * nz,
+            B[2, 0] * nx + B[2, 1] * ny + B[2, 2] * nz,
         )
-        a, b, c = points[i, 0], points[i, 1], points[i, 2]
-        J[0], J[1], J[2] = ox, oy, oz
-        J[3], J[4], J[5] = b * oz - c * oy, c * ox - a * oz, a * oy - b * ox
-        # Its partner moves with the other camera.
-        a, b, c = p[0], p[1], p[2]
-        J[6], J[7], J[8] = -nx, -ny, -nz
-        J[9], J[10], J[11] = -(b * nz - c * ny), -(c * nx - a * nz), -(a * ny - b * nx)
-        for k in range(12):
+        x, y, z = float(normals[i, 0]), float(normals[i, 1]), float(normals[i, 2])
+        mx = A[0, 0] * x + A[0, 1] * y + A[0, 2] * z
+        my = A[1, 0] * x + A[1, 1] * y + A[1, 2] * z
+        mz = A[2, 0] * x + A[2, 1] * y + A[2, 2] * z
+        if mx * nx + my * ny + mz * nz < SAME_SIDE:
+            continue
+        weight = 1 / (RESIDUAL * RESIDUAL * max(1.0, abs(residual) / HUBER))
+        # The point moves by shift + turn x point, its partner by as much of the other motion.
+        J[0], J[1], J[2] = nx, ny, nz
+        J[3], J[4], J[5] = py * nz - pz * ny, pz * nx - px * nz, px * ny - py * nx
+        J[6] = residual
+        for k in range(6):
             scaled = weight * J[k]
-            g[place[k]] -= scaled * residual
-            for q in range(12):
-                H[place[k], place[q]] += scaled * J[q]
+            for q in range(7):
+                sums[k, q] += scaled * J[q]

@@ -127,6 +127,7 @@ PAPER: dict[str, Any] = {
 # Keys that inference reads: `dapdata eval --set train.KEY=VALUE` changes them without training again. Only `crop_margin`
 # acts in training as well, with anything from none of it to twice as much.
 AT_INFERENCE = ("sample_steps", "crop_margin", "cap_crop", "refine", "hover", "ranking")
+FAST = {"sample_steps": 3}  # of `dapdata eval --fast`: a fifth of the time, for some success (docs/accuracy.md)
 
 # STEPS and CRITERIA of daptrain.refine, which must not be imported here; a test compares them.
 Step = Literal["gravity", "yaw", "settle", "search", "spread"]

@@ -313,14 +313,13 @@ def publish(
             missing=list(missing),
             stages={},
             files={},
-            created_by={"dapdata": _version()} | store.created_by(),
+            created_by=created_by(),
         )
         shards = entries.get(layout.shard_stage, []) if index else []
         now = facts.model_copy(update={"shards": shards, "stages": _stage_entries(layout, entries)})
         tables = {manifest.UNITS: folder / manifest.UNITS} if large else {}
         tables |= {manifest.INDEX: index.path} if index else {}
         _write(layout.root, now, tables, _previews(layout.root, now))
-    durable.remove_file(layout.root / manifest.PROGRESS)
     return manifest.read(layout.root)
 
 
@@ -350,12 +349,12 @@ def _gather(
                 if stage.is_shard or not shard_is_there:
                     content.add(row["sha256"] for row in record["rows"])
                 if stage.is_shard:
-                    rows.add([_index_row(recipe, entry.path, number, row) for number, row in enumerate(record["rows"])])
+                    rows.add([index_row(recipe, entry.path, number, row) for number, row in enumerate(record["rows"])])
             entries.end_group()
     return content.hexdigest(), Rejects(**{what: dict(sorted(counts.items())) for what, counts in rejects.items()})
 
 
-def _index_row(recipe: Mapping[str, Any], shard: str, number: int, row: Mapping[str, Any]) -> dict[str, Any]:
+def index_row(recipe: Mapping[str, Any], shard: str, number: int, row: Mapping[str, Any]) -> dict[str, Any]:
     """A row of the index, but for the split."""
     names = [scene["task"] for scene in recipe["scene"].get("scenes", [recipe["scene"]])]
     place = {"shard": shard, "row": number, "task": names[row["task"]]}
@@ -399,6 +398,7 @@ def _write(root: Path, now: Manifest, tables: Mapping[str, Path], previews: Mapp
         folders = sorted({shard.path.rpartition("/")[0] for shard in now.shards})
         about[manifest.CROISSANT] = croissant.render(facts, folders, index)
     manifest.publish(root, now, {**tables, **previews, **about})
+    durable.remove_file(root / manifest.PROGRESS)
 
 
 def attach(root: Path, pictures: Mapping[str, bytes]) -> None:
@@ -423,8 +423,9 @@ def _stage_entries(layout: Layout, entries: Mapping[str, Sequence[UnitEntry]]) -
     return found
 
 
-def _version() -> str:
-    return str(import_module("dapdata").__version__)
+def created_by() -> dict[str, str]:
+    """The versions that write datasets here."""
+    return {"dapdata": str(import_module("dapdata").__version__)} | store.created_by()
 
 
 def _entry(layout: Layout, stage: Stage, unit: Unit) -> tuple[UnitEntry, dict[str, Any]]:

@@ -1,13 +1,15 @@
-"""Point clouds with normals in files: ply, pcd, npz, npy. Reading checks sizes before it believes a header.
+"""Point clouds in files: ply, pcd, npz, npy. Reading checks sizes before it believes a header.
 
-Normals are needed, unit or not, and point to the sensor: which side of a surface is free cannot be told without.
+`read_cloud` needs normals, unit or not, that point to the sensor: which side of a surface is free cannot be told without.
+`read_points` takes what there is: normals, a label and the view of each point may be missing.
 """
 
 from __future__ import annotations
 
 import tokenize
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,14 +21,30 @@ from dapdata.errors import FormatError
 Array = NDArray[Any]
 
 FIELDS = ("x", "y", "z", "nx", "ny", "nz")
+LABEL, VIEW = "label", "view"  # fields of whole numbers that a point may have
+KNOWN = (*FIELDS, LABEL, VIEW)
+ARRAYS = {"points": FIELDS[:3], "normals": FIELDS[3:], LABEL: (LABEL,), VIEW: (VIEW,)}  # of npz files, and their columns
 PCD_NAMES = {"normal_x": "nx", "normal_y": "ny", "normal_z": "nz"}
 MAX_HEADER = 65_536  # bytes
-MAX_POINTS = 20_000_000
+MAX_POINTS, MAX_WORDS = 5_000_000, 10_000_000  # a cloud's points; numbers in a text file, which take ten times their memory
 BROKEN = (ValueError, EOFError, MemoryError, SyntaxError, tokenize.TokenError)  # what numpy raises at damaged headers
 PLY_TYPES = {
     "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4", "double": "f8",
     "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4", "float32": "f4", "float64": "f8",
 }  # fmt: skip
+
+
+Columns = Mapping[str, Array]  # (N,) numbers by field
+
+
+@dataclass(frozen=True)
+class Points:
+    """A cloud as its file tells it. N points."""
+
+    points: Array  # (N, 3) f8
+    normals: Array | None  # (N, 3) f8, of any length
+    label: Array | None  # (N,) i8
+    view: Array | None  # (N,) i8, which camera saw it
 
 
 def read_cloud(path: str | Path) -> tuple[Array, Array]:
@@ -36,13 +54,13 @@ def read_cloud(path: str | Path) -> tuple[Array, Array]:
         FormatError: no such file, another format, no normals, too few bytes, or numbers that are not finite.
     """
     path = Path(path)
-    readers = {".ply": _read_ply, ".pcd": _read_pcd, ".npz": _read_npz, ".npy": _read_npy}
-    if path.suffix.lower() not in readers:
-        raise FormatError(f"{path}: got '{path.suffix}', expected a point cloud: {', '.join(readers)}")
-    try:
-        rows = readers[path.suffix.lower()](path)
-    except OSError as error:
-        raise FormatError(f"{path}: cannot be read ({error.strerror or error}), expected a point cloud") from error
+    columns = _read(path)
+    missing = [name for name in FIELDS if name not in columns]
+    if missing:
+        raise FormatError(
+            f"{path}: has no {' '.join(missing)}, expected {' '.join(FIELDS)}; estimate normals that point to the sensor first"
+        )
+    rows = np.stack([columns[name] for name in FIELDS], axis=1).astype(np.float64)
     if not np.isfinite(rows).all():
         raise FormatError(f"{path}: has NaN or infinite numbers, expected finite metres; remove those points")
     lengths = np.linalg.norm(rows[:, 3:], axis=1, keepdims=True)
@@ -51,27 +69,89 @@ def read_cloud(path: str | Path) -> tuple[Array, Array]:
     return rows[:, :3], rows[:, 3:] / lengths
 
 
-def write_ply(path: str | Path, points: Array, normals: Array) -> Path:
-    """Writes (N, 3) points and normals as a binary ply that any viewer opens; returns its path."""
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}"]
-    text = "\n".join([*header, *(f"property float {name}" for name in FIELDS), "end_header", ""])
-    Path(path).write_bytes(text.encode() + np.concatenate([points, normals], axis=1).astype("<f4").tobytes())
+def read_points(path: str | Path) -> Points:
+    """The points of a ply, pcd, npz (`points`, and maybe `normals`, `label`, `view`) or npy (N, 3 or 6) file.
+
+    Rows whose x, y and z are all NaN are pixels without depth, as PCL writes them, and are left out.
+
+    Raises:
+        FormatError: no such file, another format, no x y z, too few bytes, labels that are no whole numbers.
+    """
+    path = Path(path)
+    columns = _read(path)
+    missing = [name for name in FIELDS[:3] if name not in columns]
+    if missing:
+        raise FormatError(f"{path}: has no {' '.join(missing)}, expected x y z of each point")
+    points = np.stack([columns[name] for name in FIELDS[:3]], axis=1).astype(np.float64)
+    there = ~np.isnan(points).all(axis=1)
+    normals = np.stack([columns[name] for name in FIELDS[3:]], axis=1) if {*FIELDS[3:]} <= columns.keys() else None
+    return Points(
+        points[there],
+        None if normals is None else normals[there].astype(np.float64),
+        *(_whole(path, name, columns[name][there]) if name in columns else None for name in (LABEL, VIEW)),
+    )
+
+
+def thin(edge: float, points: Array, *more: Array) -> tuple[Array, ...]:
+    """The mean in each occupied cube of some edge, m, of points (N, 3) and of what else there is of them (N, K)."""
+    cell = np.floor(points / edge).astype(np.int64)
+    which, count = np.unique(cell, axis=0, return_inverse=True, return_counts=True)[1:]
+    which = which.reshape(-1)
+    return tuple(
+        np.stack([np.bincount(which, column) for column in array.T], axis=1) / count[:, None] for array in (points, *more)
+    )
+
+
+def _whole(path: Path, name: str, column: Array) -> Array:
+    """Whole numbers as i8."""
+    if not (np.isfinite(column).all() and (column == np.round(column)).all()):
+        raise FormatError(f"{path}: {name}: has numbers that are not whole, expected whole ones")
+    return column.astype(np.int64)
+
+
+def _read(path: Path) -> Columns:
+    """The known columns of a file."""
+    readers = {".ply": _read_ply, ".pcd": _read_pcd, ".npz": _read_npz, ".npy": _read_npy}
+    if path.suffix.lower() not in readers:
+        raise FormatError(f"{path}: got '{path.suffix}', expected a point cloud: {', '.join(readers)}")
+    try:
+        return readers[path.suffix.lower()](path)
+    except OSError as error:
+        raise FormatError(f"{path}: cannot be read ({error.strerror or error}), expected a point cloud") from error
+
+
+def write_ply(path: str | Path, points: Array, normals: Array | None = None, **more: Array) -> Path:
+    """Writes (N, 3) points, with normals if there are, as a binary ply that any viewer opens; returns its path.
+
+    `more` are columns of small whole numbers (N,), such as `label`.
+    """
+    floats = points if normals is None else np.concatenate([points, normals], axis=1)
+    fields = [(name, "<f4") for name in FIELDS[: floats.shape[1]]] + [(name, "u1") for name in more]
+    rows = np.zeros(len(points), fields)
+    for name, column in zip(FIELDS, floats.T):
+        rows[name] = column
+    for name, column in more.items():
+        rows[name] = column
+    properties = [f"property {'uchar' if kind == 'u1' else 'float'} {name}" for name, kind in fields]
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}", *properties, "end_header", ""]
+    Path(path).write_bytes("\n".join(header).encode() + rows.tobytes())
     return Path(path)
 
 
-def _header(path: Path, data: bytes, end: bytes) -> tuple[list[list[str]], bytes]:
-    """The words of each line of a header, up to the line that starts with `end`; and what comes after it."""
+def _header(path: Path, end: bytes) -> tuple[list[list[str]], int]:
+    """The words of each line of a header, up to the line that starts with `end`; and where what comes after it begins."""
+    with path.open("rb") as file:
+        data = file.read(2 * MAX_HEADER)
     at = data.find(b"\n" + end, 0, MAX_HEADER)
     stop = data.find(b"\n", at + 1, at + MAX_HEADER)
     if at < 0 or stop < 0:
         raise FormatError(f"{path}: has no header that ends with '{end.decode()}', expected a {path.suffix} file")
     text = data[:stop].decode("ascii", errors="replace")
-    return [line.split() for line in text.splitlines() if line.split()], data[stop + 1 :]
+    return [line.split() for line in text.splitlines() if line.split()], stop + 1
 
 
-def _read_ply(path: Path) -> Array:
-    data = path.read_bytes()
-    lines, body = _header(path, data, b"end_header")
+def _read_ply(path: Path) -> Columns:
+    lines, start = _header(path, b"end_header")
     formats = [line[1] for line in lines if line[0] == "format" and len(line) > 1]
     elements = [i for i, line in enumerate(lines) if line[0] == "element"]
     if lines[0] != ["ply"] or not formats or not elements or lines[elements[0]][1:2] != ["vertex"]:
@@ -82,22 +162,22 @@ def _read_ply(path: Path) -> Array:
     if len(columns) != sum(line[0] == "property" for line in properties):
         raise FormatError(f"{path}: has vertex properties of unknown type, expected {', '.join(PLY_TYPES)}")
     if formats[0] == "ascii":
-        return _ascii_rows(path, body, [name for name, _ in columns], count)
+        return _ascii_columns(path, start, [name for name, _ in columns], count)
     order = {"binary_little_endian": "<", "binary_big_endian": ">"}.get(formats[0])
     if order is None:
         raise FormatError(f"{path}: format '{formats[0]}', expected ascii, binary_little_endian or binary_big_endian")
-    return _binary_rows(path, body, [(name, order + PLY_TYPES[kind]) for name, kind in columns], count)
+    return _binary_columns(path, start, [(name, order + PLY_TYPES[kind]) for name, kind in columns], count)
 
 
-def _read_pcd(path: Path) -> Array:
-    lines, body = _header(path, path.read_bytes(), b"DATA")
+def _read_pcd(path: Path) -> Columns:
+    lines, start = _header(path, b"DATA")
     about = {line[0]: line[1:] for line in lines}
     missing = {"FIELDS", "SIZE", "TYPE", "POINTS", "DATA"} - about.keys()
     if missing or not all(about[name] for name in ("FIELDS", "POINTS", "DATA")):
         raise FormatError(f"{path}: header without {', '.join(sorted(missing)) or 'values'}, expected a pcd file")
     names, count = [PCD_NAMES.get(name, name) for name in about["FIELDS"]], _number(path, about["POINTS"][0])
     if about["DATA"][0] == "ascii":
-        return _ascii_rows(path, body, names, count)
+        return _ascii_columns(path, start, names, count)
     if about["DATA"][0] != "binary":
         raise FormatError(f"{path}: DATA {about['DATA'][0]}, expected ascii or binary; save it uncompressed")
     kinds = [f"{kind.lower()}{size}" for kind, size in zip(about["TYPE"], about["SIZE"])]
@@ -105,74 +185,75 @@ def _read_pcd(path: Path) -> Array:
     if len(kinds) != len(names) or len(counts) != len(names) or not {*kinds} <= {*PLY_TYPES.values(), "i8", "u8"}:
         raise FormatError(f"{path}: FIELDS, SIZE, TYPE and COUNT do not agree, expected one of each for a field")
     fields = [(name, f"<{kind}", (n,)) if n > 1 else (name, f"<{kind}") for name, kind, n in zip(names, kinds, counts)]
-    return _binary_rows(path, body, fields, count)
+    return _binary_columns(path, start, fields, count)
 
 
-def _ascii_rows(path: Path, body: bytes, names: Sequence[str], count: int) -> Array:
-    """(N, 6) f8 from lines of numbers."""
-    words = b"\n".join(body.split(b"\n")[:count]).split()
+def _ascii_columns(path: Path, start: int, names: Sequence[str], count: int) -> Columns:
+    """The known columns of lines of numbers."""
+    if count * len(names) > MAX_WORDS:
+        raise FormatError(f"{path}: {count} points as text, expected {MAX_WORDS // len(names)} at the most; save it as binary")
+    with path.open("rb") as file:
+        file.seek(start)
+        words = b"".join(line for _, line in zip(range(count), file)).split()
     if len(words) < count * len(names):
         raise FormatError(f"{path}: holds {len(words)} numbers, expected {count} points of {len(names)}; the file is cut off")
     try:
         table = np.array(words[: count * len(names)], dtype="S32").astype(np.float64).reshape(count, len(names))
     except ValueError as error:
         raise FormatError(f"{path}: holds words among its numbers ({error}), expected points") from error
-    return table[:, _columns(path, names)]
+    return {name: table[:, names.index(name)] for name in KNOWN if name in names}
 
 
-def _binary_rows(path: Path, body: bytes, fields: Sequence[Any], count: int) -> Array:
-    """(N, 6) f8 from packed records."""
+def _binary_columns(path: Path, start: int, fields: Sequence[Any], count: int) -> Columns:
+    """The known columns of packed records."""
     names = [field[0] for field in fields]
-    columns = _columns(path, names)
     if len({*names}) != len(names):
         raise FormatError(f"{path}: names a field twice, expected {' '.join(FIELDS)} once")
-    dtype = np.dtype(list(fields))
-    if len(body) < count * dtype.itemsize:
-        raise FormatError(f"{path}: holds {len(body)} bytes, expected {count * dtype.itemsize}; the file is cut off")
-    table = np.frombuffer(body, dtype=dtype, count=count)
-    return np.stack([table[names[i]] for i in columns], axis=1).astype(np.float64)
-
-
-def _columns(path: Path, names: Sequence[str]) -> list[int]:
-    """Where x y z nx ny nz are among the named columns."""
-    missing = [name for name in FIELDS if name not in names]
-    if missing:
-        raise FormatError(
-            f"{path}: has no {' '.join(missing)}, expected {' '.join(FIELDS)}; estimate normals that point to the sensor first"
-        )
-    return [list(names).index(name) for name in FIELDS]
+    dtype, there = np.dtype(list(fields)), path.stat().st_size - start
+    if there < count * dtype.itemsize:
+        raise FormatError(f"{path}: holds {there} bytes, expected {count * dtype.itemsize}; the file is cut off")
+    table = np.fromfile(path, dtype=dtype, count=count, offset=start)
+    known = [name for name in KNOWN if name in names and table[name].ndim == 1]
+    return {name: table[name] for name in known}
 
 
 def _number(path: Path, text: str) -> int:
     if not text.isascii() or not text.isdigit() or not int(text[:12]) <= MAX_POINTS:
-        raise FormatError(f"{path}: count '{text[:20]}', expected a whole number of at most {MAX_POINTS}")
+        raise FormatError(
+            f"{path}: count '{text[:20]}', expected a whole number of at most {MAX_POINTS}; thin the cloud, to a point a mm say"
+        )
     return int(text)
 
 
-def _read_npz(path: Path) -> Array:
+def _read_npz(path: Path) -> Columns:
     try:
         with zipfile.ZipFile(path) as archive:
-            sizes = {info.filename: info.file_size for info in archive.infolist()}
-        if not {"points.npy", "normals.npy"} <= sizes.keys():
+            sizes = {info.filename.removesuffix(".npy"): info.file_size for info in archive.infolist()}
+        wanted = [name for name in ARRAYS if name in sizes]
+        if "points" not in wanted:
             raise FormatError(f"{path}: has {', '.join(sizes) or 'nothing'}, expected `points` and `normals`, both (N, 3)")
-        if max(sizes["points.npy"], sizes["normals.npy"]) > 24 * MAX_POINTS + MAX_HEADER:
-            raise FormatError(f"{path}: unpacks to more than {MAX_POINTS} points, expected fewer")
+        if any(sizes[name] > 8 * len(ARRAYS[name]) * MAX_POINTS + MAX_HEADER for name in wanted):
+            raise FormatError(f"{path}: unpacks to more than {MAX_POINTS} points, expected fewer; thin the cloud")
         with np.load(path, allow_pickle=False) as arrays:
-            points, normals = arrays["points"], arrays["normals"]
+            found = {name: arrays[name] for name in wanted}
     except (zipfile.BadZipFile, NotImplementedError, KeyError, *BROKEN) as error:
         if isinstance(error, FormatError):
             raise
         raise FormatError(f"{path}: is no npz file of plain arrays ({error}), expected `points` and `normals`") from error
-    if points.shape != normals.shape or points.shape[1:] != (3,) or points.dtype.kind not in "fiu":
-        raise FormatError(f"{path}: points {points.shape}, normals {normals.shape}, expected both (N, 3) and numbers")
-    return np.concatenate([points, normals], axis=1).astype(np.float64)
+    columns: dict[str, Array] = {}
+    for name, array in found.items():
+        shape = (len(found["points"]) if found["points"].ndim else 0, *([3] if len(ARRAYS[name]) == 3 else []))
+        if array.shape != shape or array.dtype.kind not in "fiub":
+            raise FormatError(f"{path}: {name}: {array.dtype} {array.shape}, expected numbers {shape}, a row for each point")
+        columns |= zip(ARRAYS[name], array.reshape(len(array), -1).T)
+    return columns
 
 
-def _read_npy(path: Path) -> Array:
+def _read_npy(path: Path) -> Columns:
     try:
         rows = np.load(path, allow_pickle=False, mmap_mode="r")
     except BROKEN as error:
         raise FormatError(f"{path}: is no npy file of plain numbers ({error}), expected (N, 6)") from error
-    if rows.ndim != 2 or rows.shape[1] != 6 or rows.dtype.kind not in "fiu" or len(rows) > MAX_POINTS:
+    if rows.ndim != 2 or rows.shape[1] not in (3, 6) or rows.dtype.kind not in "fiu" or len(rows) > MAX_POINTS:
         raise FormatError(f"{path}: shape {rows.shape}, expected (N, 6): x y z and the normal of each point")
-    return np.array(rows, dtype=np.float64)
+    return dict(zip(FIELDS, rows.T))

@@ -91,6 +91,25 @@ class RpdiffConfig(SceneConfig):
     )
 
 
+class ScansConfig(SceneConfig):
+    """Demonstrations that were scanned before and after, that are read instead of drawn."""
+
+    stages: ClassVar[str] = "dapdata.imports"
+    remedy: ClassVar[str] = "docs/import_scans.md tells what is behind each reason"
+    task: Literal["scans"] = "scans"
+    source: str = key("", "folder of the demonstrations, as it was named when they were imported")
+    source_sha256: str = key("", "of the names, sizes and samples of its files; another one is refused")
+    min_explained: float = key(
+        0.9, "share of the object's points after that its points before must explain, moved; larger: fewer, surer", ge=0.1, le=1
+    )
+    min_overlap: float = key(
+        0.4, "share of the object's points before that its points after must explain; larger: fewer, surer", ge=0.05, le=1
+    )
+    min_container: float = key(0.7, "share of the container's points after that those before must explain", ge=0.1, le=1)
+    align: bool = key(True, "camera poses are corrected where views overlap; needs K of cameras and the view of each point")
+    check_table: bool = key(True, "a cloud whose foot is much wider than all above is refused: it holds the table")
+
+
 class SplitConfig(Section):
     """How demos are shared out; by container and object instance, so that no instance is in two splits."""
 

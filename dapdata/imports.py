@@ -12,18 +12,25 @@ A format is a section of the recipe (`recipe.IMPORTED`) and a reader (`READERS`)
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
-from dapdata import pipeline, recipe, remote
+import numpy as np
+
+from dapdata import manifest, pipeline, recipe, remote, store
+from dapdata.config import ScansConfig
 from dapdata.errors import UsageError
-from dapdata.interop import rpdiff_clouds, rpdiff_files, rpdiff_scenes
+from dapdata.interop import scans as scan_export
+from dapdata.interop import rpdiff_clouds, rpdiff_files, rpdiff_scenes, scan_clouds, scan_files, scan_placement
 from dapdata.plan import Plan
+from dapdata.poses import inverse, symmetric_distance
 from dapdata.recipe import Recipe
-from dapdata.records import Cloud, MeshDemo, Rejected
+from dapdata.records import Cloud, MeshDemo, Rejected, read_record
 from dapdata.remote import Place
 from dapdata.stages import Draw, Inputs, Sections, Stage
 
@@ -35,7 +42,10 @@ class Reader(NamedTuple):
     observe: Callable[[Any, Any, MeshDemo], Cloud | Rejected]  # (scene section, cameras section, what demonstrate gave)
 
 
-READERS = {"rpdiff": Reader(rpdiff_scenes.demonstrate, rpdiff_clouds.observe)}  # by the scene's `task`
+READERS = {  # by the scene's `task`
+    "rpdiff": Reader(rpdiff_scenes.demonstrate, rpdiff_clouds.observe),
+    "scans": Reader(scan_placement.demonstrate, scan_clouds.observe),
+}
 
 
 def _demonstrate(made: Inputs, sections: Sections, draw: Draw) -> MeshDemo | Rejected:
@@ -49,8 +59,8 @@ def _observe(made: Inputs, sections: Sections, draw: Draw) -> Cloud | Rejected:
 
 
 STAGES = (
-    Stage("demonstrate", 1, ("scene", "placement"), (), MeshDemo, _demonstrate, packages=("pybullet", "numpy")),
-    Stage("observe", 1, ("scene", "cameras"), ("demonstrate",), Cloud, _observe, packages=("numba", "numpy")),
+    Stage("demonstrate", 1, ("scene", "placement"), (), MeshDemo, _demonstrate, packages=("pybullet", "numpy", "scipy")),
+    Stage("observe", 1, ("scene", "cameras"), ("demonstrate",), Cloud, _observe, packages=("numba", "numpy", "scipy")),
     *pipeline.STAGES[2:],
 )
 parse = recipe.from_resolved
@@ -66,6 +76,16 @@ def rpdiff_recipe(source: Path, meshes: Path | None, demos: int | None, override
     """
     section = rpdiff_files.scene_section(str(source), str(meshes) if meshes else None)
     return import_recipe(source, section, len(rpdiff_files.find(str(source))[0]), demos, overrides)
+
+
+def scans_recipe(source: Path, demos: int | None, overrides: Sequence[str]) -> Recipe:
+    """The recipe that imports scanned demonstrations, all of them or the first so many.
+
+    Raises:
+        FormatError: there are none.
+        RecipeError: an override that makes no sense.
+    """
+    return import_recipe(source, scan_files.scene_section(str(source)), len(scan_files.find(str(source))[0]), demos, overrides)
 
 
 def import_recipe(source: Path, section: Mapping[str, Any], found: int, demos: int | None, overrides: Sequence[str]) -> Recipe:
@@ -93,3 +113,87 @@ def run(asked: Recipe, out: Place | None, **options: Any) -> Place | Plan:
         if is_new and isinstance(place, Path) and place.exists():
             shutil.rmtree(place)
         raise
+
+
+# Scans -----------------------------------------------------------------------------------------------------
+
+EXAMPLE = {  # small images, so that the example is a few MB
+    "name": "example_scans",
+    "demos": 3,
+    "scene": {"task": "fruit_rack"},
+    "cameras": {
+        "width": 320,
+        "height": 180,
+        "vfov_deg": 42.0,
+        "container_views": 2,
+        "container_yaw_spread_deg": 90.0,
+        "container_distance": 0.7,
+        "container_pitch_deg": 40.0,
+        "object_views": 2,
+        "object_distance": 0.5,
+        "object_view_scale": 1.0,
+    },
+}
+WRONG, WRONG_TURN = 0.01, np.radians(20)  # m and rad: a placement that is farther from the truth is another one
+
+
+def example_scans(out: Path) -> Path:
+    """Writes three scanned demonstrations, simulated, that `import scans` takes as they are; the folder.
+
+    Raises:
+        UsageError: the folder holds something else.
+        MissingExtraError: what simulates is not installed.
+    """
+    with TemporaryDirectory() as folder:
+        dataset = Path(folder) / "example_scans"
+        pipeline.generate(recipe.from_resolved(EXAMPLE, (), "example"), dataset, workers=1, engine="inline")
+        pipeline.label(dataset, workers=1, engine="inline")
+        return scan_export.export(dataset, out)
+
+
+def rejected_scans(asked: Recipe, out: Place | None) -> Iterator[str]:
+    """A line for each demonstration of an import of scans that was rejected: its folder, the reason, what was found."""
+    config = asked.scene
+    assert isinstance(config, ScansConfig)
+    accepted = {demo for demo, _ in _imported(asked, out)}
+    for demo in sorted({*range(asked.demos)} - accepted):
+        line = scan_placement.explain(config, demo)
+        yield f"{scan_files.folder_of(config, demo)}: {line or 'too few points are left, see cameras.min_object_points'}"
+
+
+def agreement(asked: Recipe, out: Place | None) -> str:
+    """How far placements that were told from scans are from those in their `truth.json`; "" where there is none."""
+    config = asked.scene
+    assert isinstance(config, ScansConfig)
+    off = []
+    for demo, found in _imported(asked, out):
+        path = scan_files.folder_of(config, demo) / scan_export.TRUTH
+        if path.is_file():
+            truth = {
+                name: np.array(value) if name != "symmetry" else value for name, value in json.loads(path.read_bytes()).items()
+            }
+            T_goal = found.T_world_object_goal @ inverse(found.T_world_object_start) @ truth["T_world_object_start"]
+            off.append(symmetric_distance(T_goal, truth["T_world_object_goal"], truth["symmetry"], truth["axis"]))
+    if not off:
+        return ""
+    shift, turn = np.array(off).T
+    wrong = int(((shift > WRONG) | (turn > WRONG_TURN)).sum())
+    return (
+        f"against {scan_export.TRUTH}, {len(off)} demos: {1000 * np.median(shift):.1f} mm median, {1000 * np.quantile(shift, 0.9):.1f} mm "
+        f"p90; {np.degrees(np.median(turn)):.1f} deg median, {np.degrees(np.quantile(turn, 0.9)):.1f} deg p90 modulo symmetry; "
+        f"{wrong} off by more than {1000 * WRONG:.0f} mm or {np.degrees(WRONG_TURN):.0f} deg"
+    )
+
+
+def _imported(asked: Recipe, out: Place | None) -> Iterator[tuple[int, MeshDemo]]:
+    """Number and record of each demo that came in; none where nothing was published, or far away."""
+    root = remote.locate(out or Path("data") / asked.name)
+    if not isinstance(root, Path) or not (root / manifest.MANIFEST).is_file():
+        return
+    stages = manifest.read(root).stages
+    seen = {row["demo"] for unit in stages["observe"].units for row in store.read_record(root / unit.path)["rows"]}
+    for unit in stages["demonstrate"].units:
+        block = store.read_block(root / unit.path)
+        for i, row in enumerate(store.read_record(root / unit.path)["rows"]):
+            if row["demo"] in seen:
+                yield row["demo"], read_record(MeshDemo, block.sample(i))

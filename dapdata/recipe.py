@@ -18,14 +18,14 @@ from pydantic import BaseModel, Field, SerializeAsAny, ValidationError, create_m
 
 from dapdata import keys, tasks
 from dapdata.cluster import SuperpointsConfig
-from dapdata.config import PAPER, EvalConfig, RpdiffConfig, SceneConfig, Section, SplitConfig, TrainConfig, key
+from dapdata.config import PAPER, EvalConfig, RpdiffConfig, ScansConfig, SceneConfig, Section, SplitConfig, TrainConfig, key
 from dapdata.errors import UsageError, hint
 from dapdata.labels import LabelConfig
 from dapdata.observe import CamerasConfig, NoiseConfig
 from dapdata.simulate import PlacementConfig
 from dapdata.strict_yaml import Location, Source
 
-IMPORTED = {"rpdiff": RpdiffConfig}  # what is read from files, by what takes a task's place
+IMPORTED = {"rpdiff": RpdiffConfig, "scans": ScansConfig}  # what is read from files, by what takes a task's place
 NAME_PATTERN = r"^[a-z0-9][a-z0-9_-]*$"
 
 

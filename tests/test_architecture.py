@@ -20,7 +20,7 @@ DAPTRAIN = sorted((ROOT / "train/daptrain").rglob("*.py"))
 LINES = (
     ("errors", "rng", "poses", "config"),
     ("records", "strict_yaml", "durable", "clouds", "console"),
-    ("solids", "keys", "slic", "split", "matching", "tables", "buckets"),
+    ("solids", "registration", "keys", "slic", "split", "matching", "tables", "buckets"),
     ("meshes", "tabletop"),
     ("tasks",),
     ("simulate", "observe", "cluster", "labels"),

@@ -95,7 +95,7 @@ def find(source: str) -> tuple[tuple[Place, ...], str]:
     root = Path(source)
     if not root.exists():
         raise FormatError(f"{root}: no such file or folder, expected demos of RPDiff (demo_aug_*.npz); check the path")
-    files = [root] if root.is_file() else sorted(root.rglob("*.npz"), key=_natural)
+    files = [root] if root.is_file() else sorted(root.rglob("*.npz"), key=natural)
     files = [file for file in files if SLOTS not in file.name]
     places, whole, recognised = [], sha256(), False
     for file in files:
@@ -114,7 +114,7 @@ def find(source: str) -> tuple[tuple[Place, ...], str]:
     return tuple(places), whole.hexdigest()
 
 
-def _natural(path: Path) -> tuple[Any, ...]:
+def natural(path: Path) -> tuple[Any, ...]:
     """Numbers in names count as numbers."""
     return tuple((int(word), "") if word.isdecimal() else (-1, word) for word in re.split(r"(\d+)", path.as_posix()))
 
@@ -149,7 +149,7 @@ def mesh_folder(folder: str) -> MeshFolder:
         raise FormatError(f"{root}: no such folder, expected meshes ({', '.join(meshes.SUFFIXES)}); check --meshes")
     found: dict[str, tuple[Path, ...]] = {}
     whole = sha256()
-    for path in sorted(root.rglob("*"), key=_natural):
+    for path in sorted(root.rglob("*"), key=natural):
         if path.is_file() and (path.suffix.lower() in meshes.SUFFIXES or path.name.endswith(SLOT_SUFFIXES)):
             found[path.name] = (*found.get(path.name, ()), path)
             whole.update(durable.canonical([path.relative_to(root).as_posix(), durable.hash_file(path)]))

@@ -39,7 +39,7 @@ CLICK_ERROR: type[Exception] = typer.BadParameter.__mro__[2]  # ClickException, 
 STOPPED, INTERRUPTED = "stopped; the same command, run again, goes on where it stopped", 130
 
 Net = Literal["both", "affordance", "pose"]
-Protocol = Literal["strict", "rpdiff"]
+Protocol = Literal["strict", "rpdiff", "shown"]
 Split = Literal["train", "val", "test"]
 
 
@@ -671,14 +671,10 @@ def import_scans(
     means = {"workers": workers, "engine": engine, "memory": memory, "allow_missing": allow_missing, "fresh": fresh}
     try:
         _import(asked, out, dry_run, as_json, **means)
-    finally:
+    finally:  # also when all were rejected
         if not dry_run:
-            for line in rejected_scans(asked, out):
+            for line in (*rejected_scans(asked, out), *agreement(asked, out)):
                 say(line)
-    if not dry_run:
-        found = agreement(asked, out)
-        if found:
-            say(found)
 
 
 def _import(asked: Any, out: str | None, dry_run: bool, as_json: bool, **means: Any) -> None:
@@ -754,7 +750,7 @@ def export_scans(
     demos: AtMost = None,
     as_json: Json = False,
 ) -> None:
-    """Simulated scans before and after, for `dapdata import scans`. With noise, partial views, and the truth to compare with."""
+    """Simulated scans before and after, for `dapdata import scans`. With noise, partial views, and the truth beside them."""
     _export("scans", dataset, out, as_json, split=split, demos=demos)
 
 

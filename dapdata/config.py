@@ -110,6 +110,9 @@ class ScansConfig(SceneConfig):
     check_table: bool = key(True, "a cloud whose foot is much wider than all above is refused: it holds the table")
 
 
+IMPORTED: dict[str, type[SceneConfig]] = {"rpdiff": RpdiffConfig, "scans": ScansConfig}  # by what takes a task's place
+
+
 class SplitConfig(Section):
     """How demos are shared out; by container and object instance, so that no instance is in two splits."""
 
@@ -264,7 +267,7 @@ class EvalConfig(Section):
     trials: int = key(100, "demos of the split that are judged", ge=1)
     k: int = key(8, "candidates per demo that are ranked and judged", ge=1, le=1024)
     draws: int | None = key(None, "candidates per demo that the modes are counted on, at least k; null: k", ge=1, le=1024)
-    protocol: Literal["strict", "rpdiff"] = key("strict", "rules of the judge, see docs/metrics.md")
+    protocol: Literal["strict", "rpdiff", "shown"] = key("strict", "rules of the judge, see docs/metrics.md")
 
     @model_validator(mode="after")
     def check_draws(self) -> EvalConfig:

@@ -18,6 +18,7 @@ import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -25,12 +26,12 @@ import numpy as np
 from dapdata import manifest, pipeline, recipe, remote, store
 from dapdata.config import ScansConfig
 from dapdata.errors import UsageError
-from dapdata.interop import scans as scan_export
 from dapdata.interop import rpdiff_clouds, rpdiff_files, rpdiff_scenes, scan_clouds, scan_files, scan_placement
+from dapdata.interop import scans as scan_export
 from dapdata.plan import Plan
 from dapdata.poses import inverse, symmetric_distance
 from dapdata.recipe import Recipe
-from dapdata.records import Cloud, MeshDemo, Rejected, read_record
+from dapdata.records import Cloud, Demo, MeshDemo, Rejected, read_record
 from dapdata.remote import Place
 from dapdata.stages import Draw, Inputs, Sections, Stage
 
@@ -85,10 +86,18 @@ def scans_recipe(source: Path, demos: int | None, overrides: Sequence[str]) -> R
         FormatError: there are none.
         RecipeError: an override that makes no sense.
     """
-    return import_recipe(source, scan_files.scene_section(str(source)), len(scan_files.find(str(source))[0]), demos, overrides)
+    section, found = scan_files.scene_section(str(source)), len(scan_files.find(str(source))[0])
+    return import_recipe(source, section, found, demos, overrides, {"eval": {"protocol": "shown"}})
 
 
-def import_recipe(source: Path, section: Mapping[str, Any], found: int, demos: int | None, overrides: Sequence[str]) -> Recipe:
+def import_recipe(
+    source: Path,
+    section: Mapping[str, Any],
+    found: int,
+    demos: int | None,
+    overrides: Sequence[str],
+    more: Mapping[str, Any] = MappingProxyType({}),
+) -> Recipe:
     """A recipe that imports, named after the file or folder.
 
     Args:
@@ -97,9 +106,10 @@ def import_recipe(source: Path, section: Mapping[str, Any], found: int, demos: i
         found: Demos in the source.
         demos: At most so many; None: all.
         overrides: As of `--set`.
+        more: Other sections.
     """
     name = re.sub(r"[^a-z0-9_-]+", "_", source.resolve().stem.lower()).strip("_-")[:64] or str(section["task"])
-    tree = {"name": name, "demos": min(found, demos or found), "scene": dict(section), **NO_NOISE}
+    tree = {"name": name, "demos": min(found, demos or found), "scene": dict(section), **NO_NOISE, **more}
     return recipe.from_resolved(tree, overrides, "import")
 
 
@@ -134,7 +144,8 @@ EXAMPLE = {  # small images, so that the example is a few MB
         "object_view_scale": 1.0,
     },
 }
-WRONG, WRONG_TURN = 0.01, np.radians(20)  # m and rad: a placement that is farther from the truth is another one
+WRONG_MM, WRONG_DEG = 10.0, 20.0  # a placement that is farther from the truth is another one
+TOLD = 20  # rejected demonstrations that are told one by one; each is registered again for that
 
 
 def example_scans(out: Path) -> Path:
@@ -152,40 +163,42 @@ def example_scans(out: Path) -> Path:
 
 
 def rejected_scans(asked: Recipe, out: Place | None) -> Iterator[str]:
-    """A line for each demonstration of an import of scans that was rejected: its folder, the reason, what was found."""
+    """A line for each of the first demonstrations of an import of scans that were rejected: folder, reason, what was found."""
     config = asked.scene
     assert isinstance(config, ScansConfig)
     accepted = {demo for demo, _ in _imported(asked, out)}
-    for demo in sorted({*range(asked.demos)} - accepted):
-        line = scan_placement.explain(config, demo)
-        yield f"{scan_files.folder_of(config, demo)}: {line or 'too few points are left, see cameras.min_object_points'}"
+    rejected = sorted({*range(asked.demos)} - accepted)
+    for demo in rejected[:TOLD]:
+        line = scan_placement.explain(config, demo) or "too few points are left, see cameras.min_object_points"
+        yield f"{scan_files.folder_of(config, demo)}: {line}"
+    if len(rejected) > TOLD:
+        yield f"and {len(rejected) - TOLD} more that were rejected"
 
 
-def agreement(asked: Recipe, out: Place | None) -> str:
-    """How far placements that were told from scans are from those in their `truth.json`; "" where there is none."""
+def agreement(asked: Recipe, out: Place | None) -> Iterator[str]:
+    """A line that says how far placements that were told from scans are from their `truth.json`; none where there is none."""
     config = asked.scene
     assert isinstance(config, ScansConfig)
     off = []
     for demo, found in _imported(asked, out):
         path = scan_files.folder_of(config, demo) / scan_export.TRUTH
         if path.is_file():
-            truth = {
-                name: np.array(value) if name != "symmetry" else value for name, value in json.loads(path.read_bytes()).items()
-            }
-            T_goal = found.T_world_object_goal @ inverse(found.T_world_object_start) @ truth["T_world_object_start"]
-            off.append(symmetric_distance(T_goal, truth["T_world_object_goal"], truth["symmetry"], truth["axis"]))
-    if not off:
-        return ""
-    shift, turn = np.array(off).T
-    wrong = int(((shift > WRONG) | (turn > WRONG_TURN)).sum())
-    return (
-        f"against {scan_export.TRUTH}, {len(off)} demos: {1000 * np.median(shift):.1f} mm median, {1000 * np.quantile(shift, 0.9):.1f} mm "
-        f"p90; {np.degrees(np.median(turn)):.1f} deg median, {np.degrees(np.quantile(turn, 0.9)):.1f} deg p90 modulo symmetry; "
-        f"{wrong} off by more than {1000 * WRONG:.0f} mm or {np.degrees(WRONG_TURN):.0f} deg"
-    )
+            truth = json.loads(path.read_bytes())
+            T_start, T_shown = (np.array(truth[f"T_world_object_{name}"]) for name in ("start", "goal"))
+            T_goal = found.T_world_object_goal @ inverse(found.T_world_object_start) @ T_start
+            off.append(symmetric_distance(T_goal, T_shown, truth["symmetry"], np.array(truth["axis"])))
+    if off:
+        shift, turn = 1000 * np.array(off)[:, 0], np.degrees(off)[:, 1]
+        wrong = int(((shift > WRONG_MM) | (turn > WRONG_DEG)).sum())
+        yield (
+            f"against {scan_export.TRUTH}, {len(off)} demos: "
+            f"{np.median(shift):.1f} mm median, {np.quantile(shift, 0.9):.1f} p90; "
+            f"{np.median(turn):.1f} deg median, {np.quantile(turn, 0.9):.1f} p90 modulo symmetry; {wrong} off by more than "
+            f"{WRONG_MM:.0f} mm or {WRONG_DEG:.0f} deg"
+        )
 
 
-def _imported(asked: Recipe, out: Place | None) -> Iterator[tuple[int, MeshDemo]]:
+def _imported(asked: Recipe, out: Place | None) -> Iterator[tuple[int, Demo]]:
     """Number and record of each demo that came in; none where nothing was published, or far away."""
     root = remote.locate(out or Path("data") / asked.name)
     if not isinstance(root, Path) or not (root / manifest.MANIFEST).is_file():

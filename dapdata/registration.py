@@ -55,6 +55,10 @@ class Surface:
         """The cloud after a motion."""
         return Surface(transform(T, self.points), rotate(T, self.normals))
 
+    def with_points_of(self, other: Surface) -> Surface:
+        """Both clouds together."""
+        return Surface(np.concatenate([self.points, other.points]), np.concatenate([self.normals, other.normals]))
+
     def thinned(self, count: int) -> Surface:
         """Every so many-th point, no more than `count` of them."""
         step = -(-len(self.points) // count)

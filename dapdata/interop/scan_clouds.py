@@ -26,7 +26,8 @@ NEIGHBOURS = 30  # points to whose plane a normal is square: more than of clean 
 WIDE = np.array([[600.0, 0, 1e5], [0, 600, 1e5], [0, 0, 1]])  # px: a camera whose intrinsics nobody told sees all before it
 CELL = {"container": 0.02, "object": 0.01}  # m: parts of a body are no farther apart than a cell
 CRUMB = {"container": 0.02, "object": 0.1}  # share of the points below which a part is not of the body
-FLYERS = 3  # points in a cell: fewer are flying pixels
+FLYERS = 6  # points in a cell and those around it: fewer are flying pixels
+INWARDS = -0.1  # mean cosine
 MOST_OUTLIERS = 0.2  # share
 
 
@@ -99,7 +100,7 @@ def _views(where: Where, cloud: Points, scan: Scan) -> list[View]:
     thinned = [_thinned(cloud.points[own], None if cloud.normals is None else cloud.normals[own]) for own in rows]
     if not count:
         points, normals = thinned[0]
-        if body == "object" and np.einsum("ij,ij->", normals, points - points.mean(axis=0)) < 0:
+        if body == "object" and _outwards(points, normals) < INWARDS:
             raise Fault("normals_inwards", f"{stage}, {body}: most normals look inwards, expected outwards; flip them")
         return thinned
     if cloud.view is not None:
@@ -108,6 +109,12 @@ def _views(where: Where, cloud: Points, scan: Scan) -> list[View]:
     K = np.where(np.isnan(scan.K), WIDE, scan.K)
     owner, normals = by_camera(points, normals, K, scan.T_world_camera)
     return [(points[owner == v], normals[owner == v]) for v in range(count)]
+
+
+def _outwards(points: Array, normals: Array) -> float:
+    """Mean cosine between normals and the way from the middle: 1 of a ball, near 0 of a single face, negative if flipped."""
+    way = points - points.mean(axis=0)
+    return float((np.einsum("ij,ij->i", normals, way) / np.maximum(np.linalg.norm(way, axis=1), 1e-9)).mean())
 
 
 def _thinned(points: Array, normals: Array | None) -> View:
@@ -144,28 +151,29 @@ def _clean(where: Where, views: list[View]) -> list[View]:
     if lost > MOST_OUTLIERS:
         raise Fault(
             "scattered",
-            f"{stage}, {body}: {lost:.0%} of the points are apart from the rest, expected {MOST_OUTLIERS:.0%} at the most; look at the mask",
+            f"{stage}, {body}: {lost:.0%} of the points are apart from the rest, expected {MOST_OUTLIERS:.0%} at the most; "
+            "look at the mask",
         )
     parts = np.split(keep, np.cumsum([len(points) for points, _ in views])[:-1])
     return [(points[own], normals[own]) for (points, normals), own in zip(views, parts)]
 
 
 def _is_body(points: Array, edge: float, crumb: float) -> Array:
-    """(N,) bool: points in cells that hold several, in parts (connected cells) that hold a share of `crumb` at least."""
+    """(N,) bool: points with others in and around their cell, in parts (connected cells) with a share of `crumb` at least."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
     from scipy.spatial import cKDTree
 
     cells, cell, count = np.unique(np.floor(points / edge), axis=0, return_inverse=True, return_counts=True)
     cell = cell.reshape(-1)
-    full = np.flatnonzero(count >= FLYERS)
-    pairs = cKDTree(cells[full]).query_pairs(1.8, output_type="ndarray") if len(full) else np.zeros((0, 2), int)
-    links = coo_matrix((np.ones(len(pairs)), pairs.T), (len(full), len(full)))
-    part = np.full(len(cells), -1)
-    part[full] = connected_components(links, directed=False)[1]
-    of_point = part[cell]
-    size = np.bincount(of_point[of_point >= 0], minlength=1)
-    return (of_point >= 0) & (size[of_point] >= crumb * len(points))
+    a, b = cKDTree(cells).query_pairs(1.8, output_type="ndarray").reshape(-1, 2).T
+    around = count + np.bincount(a, count[b], len(cells)) + np.bincount(b, count[a], len(cells))
+    dense = around >= FLYERS
+    both = dense[a] & dense[b]
+    links = coo_matrix((np.ones(int(both.sum())), (a[both], b[both])), (len(cells), len(cells)))
+    part = connected_components(links, directed=False)[1]
+    size = np.bincount(part, count)
+    return np.asarray((dense & (size[part] >= crumb * len(points)))[cell])
 
 
 def _aligned(views: Mapping[Where, list[View]], scan: Scan) -> Array:
@@ -176,7 +184,9 @@ def _aligned(views: Mapping[Where, list[View]], scan: Scan) -> Array:
     cameras = [
         Camera(int(np.ceil(2 * K[0, 2])), int(np.ceil(2 * K[1, 2])), K, T, T, 0) for K, T in zip(scan.K, scan.T_world_camera)
     ]
-    table = _views(("start", "table"), scan.rest, scan) if scan.rest.view is not None else [(np.zeros((0, 3)),) * 2] * len(cameras)
+    table = (
+        _views(("start", "table"), scan.rest, scan) if scan.rest.view is not None else [(np.zeros((0, 3)),) * 2] * len(cameras)
+    )
     of_camera = [[*(found[v] for found in views.values()), table[v]] for v in range(len(cameras))]
     points, normals = ([np.concatenate([view[k] for view in own]) for own in of_camera] for k in range(2))
     return align(cameras, points, normals)

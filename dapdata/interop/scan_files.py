@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from dapdata import clouds, durable, store
+from dapdata import clouds, durable
 from dapdata.clouds import Points
 from dapdata.config import ScansConfig, Section, key
 from dapdata.errors import FormatError, UsageError
@@ -54,8 +54,10 @@ SUFFIXES = (".ply", ".pcd", ".npz")
 CLOUDS = (*STAGES, *(f"{stage}_{body}" for stage in STAGES for body in BODIES))  # names without suffix
 ABOUT = "scan.json"
 SPANS = {"container": (0.05, 5.0), "object": (0.005, 1.0)}  # m
+ROUGH = 1e-3  # of a rotation in text with few digits
 SAMPLE = 65_536  # bytes at the beginning, middle and end of a file by which another one is known
 LEVEL = 0.01  # m: thickness of a table in a scan
+FOOT_SHARE, FOOT_WIDER = (0.25, 0.97), 2.0  # shares of points and times the area that make a foot a table
 LEVEL_SHARE = 2.0  # times as many of the rest's points lie in one layer across another axis: that one is up
 
 
@@ -223,7 +225,7 @@ def read_about(source: Path, folder: Path) -> About:
 
 
 def _unit(vector: Vector) -> Array:
-    return np.asarray(vector) / np.linalg.norm(vector)
+    return np.asarray(np.array(vector) / np.linalg.norm(vector))
 
 
 def _moved(cloud: Points, T: Array, scale: float = 1.0) -> Points:
@@ -251,17 +253,19 @@ def _cameras(about: About) -> tuple[Array, Array]:
             if [len(row) for row in value] != [shape[1]] * shape[0] or not np.isfinite(value).all():
                 raise Fault("bad_camera", f"cameras.{v}.{name}: expected {shape[0]} rows of {shape[1]} finite numbers")
             into[v] = value
-        if not store.is_rigid(T[v]):
-            mirrored = np.linalg.det(T[v, :3, :3]) < 0
-            what = "mirrored (its determinant is negative)" if mirrored else "no rotation and shift"
+        R = T[v, :3, :3]
+        if np.abs(R @ R.T - np.eye(3)).max() > ROUGH or np.linalg.det(R) < 0 or (T[v, 3] != (0, 0, 0, 1)).any():
+            what = "mirrored (its determinant is negative)" if np.linalg.det(R) < 0 else "no rotation and shift"
             raise Fault("bad_camera", f"cameras.{v}.T_world_camera: is {what}, expected a rigid pose of the camera in the scan")
+        left, _, right = np.linalg.svd(R)
+        T[v, :3, :3] = left @ right
         if not np.isnan(K[v]).any() and (K[v, [0, 1], [0, 1]] <= 0).any():
             raise Fault("bad_camera", f"cameras.{v}.K: focal lengths {K[v, 0, 0]}, {K[v, 1, 1]}, expected more than 0 px")
     return K, T
 
 
 def _camera_in_world(T_scan_camera: Array, T_world_scan: Array, scale: float) -> Array:
-    return T_world_scan @ pose(T_scan_camera[:3, :3], T_scan_camera[:3, 3] * scale)
+    return np.asarray(T_world_scan @ pose(T_scan_camera[:3, :3], T_scan_camera[:3, 3] * scale))
 
 
 def _clouds(folder: Path, cameras: int) -> tuple[dict[tuple[str, str], Points], Points]:
@@ -292,7 +296,7 @@ def _clouds(folder: Path, cameras: int) -> tuple[dict[tuple[str, str], Points], 
             if array is not None and not np.isfinite(array).all():
                 bad = int((~np.isfinite(array).all(axis=1)).sum())
                 raise Fault("not_finite", f"{where}: {bad} of {len(array)} {name} are not finite; remove them")
-        if cloud.view is not None and not (0 <= cloud.view.min() and cloud.view.max() < max(cameras, 1)):
+        if cloud.view is not None and not (cloud.view.min() >= 0 and cloud.view.max() < max(cameras, 1)):
             raise Fault("bad_labels", f"{where}: views {cloud.view.min()} to {cloud.view.max()}, expected 0 to {cameras - 1}")
     return found, rest
 
@@ -324,7 +328,8 @@ def _labels(path: Path, cloud: Points) -> Array:
 
 
 def _part(cloud: Points, rows: Array) -> Points:
-    return Points(*(None if array is None else array[rows] for array in vars(cloud).values()))
+    normals, label, view = (None if array is None else array[rows] for array in (cloud.normals, cloud.label, cloud.view))
+    return Points(cloud.points[rows], normals, label, view)
 
 
 # Is it plausible -------------------------------------------------------------------------------------------
@@ -373,25 +378,21 @@ def _check_up(about: About, T_world_camera: Array, container: Array) -> None:
         if above.max() < 0:
             raise Fault(
                 "wrong_up",
-                f"all cameras are below the container, by {-above.max():.2f} m and more, with up {about.up}, expected one above; "
+                f"all cameras are {-above.max():.2f} m or more below the container with up {about.up}, expected one above; "
                 f'set "up" in {ABOUT}, or give poses of cameras in the scan, not of the scan in cameras',
             )
 
 
 def _check_no_table(where: str, points: Array) -> None:
     """Whether the foot of a body is not much wider than all above it: then it is what it stands on."""
-    low = float(np.quantile(points[:, 2], 0.01))
-    foot = points[:, 2] < low + LEVEL
-    share = float(foot.mean())
-    if share < 0.25 or share > 0.97:
+    foot = points[:, 2] < np.quantile(points[:, 2], 0.01) + LEVEL
+    if not FOOT_SHARE[0] <= foot.mean() <= FOOT_SHARE[1]:
         return
-    areas = [
-        float(np.prod(np.quantile(p[:, :2], 0.98, axis=0) - np.quantile(p[:, :2], 0.02, axis=0)))
-        for p in (points[foot], points[~foot])
-    ]
-    if areas[0] > 2 * areas[1]:
+    below, above = (np.quantile(part[:, :2], (0.02, 0.98), axis=0) for part in (points[foot], points[~foot]))
+    wider = float(np.prod(np.ptp(below, axis=0)) / np.prod(np.ptp(above, axis=0)))
+    if wider > FOOT_WIDER:
         raise Fault(
             "table_in_cloud",
-            f"{where}: {share:.0%} of the points lie within {LEVEL * 100:.0f} cm of its foot and reach over {areas[0] / areas[1]:.1f} times the "
+            f"{where}: {foot.mean():.0%} of the points are within {LEVEL * 100:.0f} cm of its foot, on {wider:.1f} times the "
             "area of the rest, expected no table in the mask; take it out, or use --set scene.check_table=false if it is a tray",
         )

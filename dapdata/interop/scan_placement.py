@@ -1,7 +1,7 @@
 """From scans before and after to a demonstration: where the object was placed, or why that cannot be told.
 
-The container's motion on the table is told first, then the object's in the world; together they say where the object went in the
-container as it stood before. Whatever explains too little, or is not the only explanation, is rejected with its figure.
+The container's motion on the table is told first, then the object's in the world; together they say where the object went in
+the container as it stood before. Whatever explains too little, or is not the only explanation, is rejected with its figure.
 
 A scan tells no shapes: a demo has no parts, one goal, and no physics. Its object frame has its origin in the middle of what was
 seen (of a revolution, on the axis).
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from dapdata import registration, solids
 from dapdata.config import ScansConfig
 from dapdata.interop.scan_clouds import Prepared, prepare
-from dapdata.interop.scan_files import Fault, Scan, read
+from dapdata.interop.scan_files import STAGES, Fault, Scan, read
 from dapdata.poses import angle_between, inverse, nearest_symmetric, pose, rotation_about, transform, upright_turn
 from dapdata.records import GOAL_KINDS, SYMMETRIES, MeshDemo, Meshes, Rejected, pack_meshes
 from dapdata.registration import Fit, Surface
@@ -71,17 +71,26 @@ def place(scan: Scan, prepared: Prepared, config: ScansConfig) -> Placed:
     Raises:
         Fault: that cannot be told.
     """
-    containers = [_surface(prepared, stage, "container", CONTAINER_SPACING) for stage in ("start", "end")]
+    before, after = (_surface(prepared, stage, "container", CONTAINER_SPACING) for stage in STAGES)
     points = np.concatenate([points for points, _ in prepared.views["start", "object"]])
     extent = float(np.ptp(np.quantile(points, [0.02, 0.98], axis=0), axis=0).max())
     spacing = max(LEAST_SPACING, extent / SPACINGS)
-    objects = [_surface(prepared, stage, "object", spacing) for stage in ("start", "end")]
-    for stage, surface in zip(("start", "end"), objects):
+    start, end = (_surface(prepared, stage, "object", spacing) for stage in STAGES)
+    for stage, surface in zip(STAGES, (start, end)):
         if len(surface.points) < LEAST_POINTS:
             raise Fault("does_not_fit", f"{stage}, object: {len(surface.points)} points, expected {LEAST_POINTS} or more")
-    _check_order(containers, objects)
-    container = _container_motion(*containers, config)
-    found = registration.register(*objects, spacing, registration.turns_all())
+    _check_order((before, after), (start, end))
+    container = _container_motion(before, after, config)
+    fit, surface = _object_motion(start, end, spacing, config)
+    return Placed(container, fit, surface, inverse(container.T))
+
+
+def _object_motion(before: Surface, after: Surface, spacing: float, config: ScansConfig) -> tuple[Fit, Surface]:
+    """How the object moved in the world, and all that was seen of it, as it stood before.
+
+    Of motions that bring its surface to the same place, as of a ball, it is the one that turns least.
+    """
+    found = registration.register(before, after, spacing, registration.turns_all())
     best = found[0]
     told = f"the object before explains {best.explained_after:.2f} of it after, and is explained to {best.explained_before:.2f}"
     if best.explained_after < config.min_explained or best.explained_before < config.min_overlap:
@@ -90,21 +99,17 @@ def place(scan: Scan, prepared: Prepared, config: ScansConfig) -> Placed:
             f"{told} (rms {best.rms * 1000:.1f} mm), expected {config.min_explained} and {config.min_overlap} or more; "
             "scan it from more sides",
         )
-    seen = Surface(*(np.concatenate(both) for both in zip(_arrays(objects[0]), _arrays(objects[1].moved(inverse(best.T))))))
+    surface = before.with_points_of(after.moved(inverse(best.T)))
     rivals = registration.as_good(found)
-    gaps = [registration.surface_gap(fit.T, best.T, seen.points) for fit in rivals]
-    if max(gaps) > registration.EXPLAINED * spacing:
+    gaps = np.array([registration.surface_gap(fit.T, best.T, surface.points) for fit in rivals])
+    elsewhere = gaps > registration.EXPLAINED * spacing
+    if elsewhere.any():
         raise Fault(
             "ambiguous",
-            f"{told}, and so do {sum(gap > registration.EXPLAINED * spacing for gap in gaps)} other motions, up to {max(gaps) * 1000:.0f} mm "
-            "away, expected one; scan it from more sides",
+            f"{told}, and as well by {elsewhere.sum()} other motions, up to {gaps.max() * 1000:.0f} mm away, expected one; "
+            "scan it from more sides",
         )
-    least = min(rivals, key=lambda fit: float(angle_between(fit.T[:3, :3], np.eye(3))))  # the surface is the same
-    return Placed(container, least, seen, inverse(container.T))
-
-
-def _arrays(surface: Surface) -> tuple[Array, Array]:
-    return surface.points, surface.normals
+    return min(rivals, key=lambda fit: float(angle_between(fit.T[:3, :3], np.eye(3)))), surface
 
 
 def _surface(prepared: Prepared, stage: str, body: str, spacing: float) -> Surface:
@@ -112,14 +117,14 @@ def _surface(prepared: Prepared, stage: str, body: str, spacing: float) -> Surfa
     return Surface(fused.points.astype(float), fused.normals.astype(float))
 
 
-def _check_order(containers: list[Surface], objects: list[Surface]) -> None:
-    """Whether the object came to the container."""
+def _check_order(containers: tuple[Surface, Surface], objects: tuple[Surface, Surface]) -> None:
+    """Whether the object came to the container; each before and after."""
     gaps = [float(container.tree.query(thing.points)[0].min()) for container, thing in zip(containers, objects)]
     inside = [_is_over(container.points, thing.points) for container, thing in zip(containers, objects)]
     if inside[0] and not inside[1]:
         raise Fault(
             "start_and_end_swapped",
-            f"the object is in the container in the start and {gaps[1] * 100:.0f} cm from it in the end, expected the reverse; swap them",
+            f"the object is in the container in the start and {gaps[1] * 100:.0f} cm from it in the end, expected the reverse",
         )
     if gaps[1] > NEAR:
         raise Fault(
@@ -158,8 +163,7 @@ def _demo(scan: Scan, prepared: Prepared, placed: Placed) -> MeshDemo:
     T_world_container = _container_pose(scan, prepared)
     T_start, T_goal, axis = _object_poses(scan, placed)
     opening = T_world_container[:3, :3].T @ scan.opening
-    no_meshes = pack_meshes([])
-    none = {"kind": np.zeros(0, np.uint8), "size": np.zeros((0, 3)), "T": np.zeros((0, 4, 4))}
+    no_meshes, no_kinds, no_sizes, no_poses = pack_meshes([]), np.zeros(0, np.uint8), np.zeros((0, 3)), np.zeros((0, 4, 4))
     return MeshDemo(
         **{field.name: getattr(no_meshes, field.name) for field in fields(Meshes)},
         T_world_container=T_world_container,
@@ -169,19 +173,19 @@ def _demo(scan: Scan, prepared: Prepared, placed: Placed) -> MeshDemo:
         goal_kind=np.array([GOAL_KINDS.index("shown")], np.uint8),
         goal_clearance=np.array([solids.UNBOUNDED]),
         goal_approach=opening[None],
-        rejected_goals=none["T"],
-        rejected_reason=none["kind"],
+        rejected_goals=no_poses,
+        rejected_reason=no_kinds,
         symmetry_kind=np.array(SYMMETRIES.index(scan.about.symmetry), np.uint8),
         symmetry_axis=axis,
-        part_kind=none["kind"],
-        part_size=none["size"],
-        T_container_part=none["T"],
-        part_role=none["kind"],
+        part_kind=no_kinds,
+        part_size=no_sizes,
+        T_container_part=no_poses,
+        part_role=no_kinds,
         opening=opening,
         max_tilt=np.array(np.pi),
-        object_kind=none["kind"],
-        object_size=none["size"],
-        T_object_part=none["T"],
+        object_kind=no_kinds,
+        object_size=no_sizes,
+        T_object_part=no_poses,
         demo=np.array(0),
         seed=np.array(0),
         container_instance=np.array(_instance(scan, "container")),

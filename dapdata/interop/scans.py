@@ -62,7 +62,7 @@ def export(
     """
     chosen = choose(dataset, split, demos)
     recipe = chosen.dataset.recipe
-    cameras, noise = (kind.model_validate(recipe[name]) for kind, name in ((CamerasConfig, "cameras"), (NoiseConfig, "noise")))
+    cameras, noise = CamerasConfig.model_validate(recipe["cameras"]), NoiseConfig.model_validate(recipe["noise"])
 
     def write(piece: Piece, folder: Path, rows: Iterator[Row]) -> None:
         for about, sample in rows:

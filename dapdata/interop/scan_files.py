@@ -394,5 +394,5 @@ def _check_no_table(where: str, points: Array) -> None:
         raise Fault(
             "table_in_cloud",
             f"{where}: {foot.mean():.0%} of the points are within {LEVEL * 100:.0f} cm of its foot, on {wider:.1f} times the "
-            "area of the rest, expected no table in the mask; take it out, or use --set scene.check_table=false if it is a tray",
+            "area of the rest, expected no table in the mask; take it out, or --set scene.check_table=false if it is a tray",
         )

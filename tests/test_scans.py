@@ -342,9 +342,12 @@ def test_a_face_that_fits_in_several_places_is_ambiguous(tmp_path: Path) -> None
     assert re.match(r"ambiguous: .* as well by \d other motions, up to \d+ mm away, expected one", line), line
 
 
-def test_every_reason_is_made_by_a_test() -> None:
+def test_every_reason_is_made_by_a_test_and_documented() -> None:
     by_hand = {"ambiguous", "unreadable", "bad_labels", "empty_mask", "no_normals"}  # in the tests above
     assert {reason for reason, *_ in FAULTS.values()} | by_hand == scan_files.REASONS.keys()
+    page = (Path(__file__).parents[1] / "docs/import_scans.md").read_text()
+    for reason, words in scan_files.REASONS.items():
+        assert f"| `{reason}` | {words} |" in page
 
 
 def test_a_folder_without_scans_is_refused(tmp_path: Path) -> None:

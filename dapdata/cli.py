@@ -665,16 +665,20 @@ def import_scans(
     as_json: Json = False,
 ) -> None:
     """Your own scans, before and after. Where the object went is told by registration, or the demo is rejected."""
+    from dapdata.errors import RejectedError
     from dapdata.imports import agreement, rejected_scans, scans_recipe
 
     asked = scans_recipe(source, demos, overrides or ())
     means = {"workers": workers, "engine": engine, "memory": memory, "allow_missing": allow_missing, "fresh": fresh}
     try:
         _import(asked, out, dry_run, as_json, **means)
-    finally:  # also when all were rejected
-        if not dry_run:
-            for line in (*rejected_scans(asked, out), *agreement(asked, out)):
-                say(line)
+    except RejectedError:
+        for line in rejected_scans(asked, out):
+            say(line)
+        raise
+    if not dry_run:
+        for line in (*rejected_scans(asked, out), *agreement(asked, out)):
+            say(line)
 
 
 def _import(asked: Any, out: str | None, dry_run: bool, as_json: bool, **means: Any) -> None:

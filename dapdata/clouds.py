@@ -94,8 +94,12 @@ def read_points(path: str | Path) -> Points:
 
 def thin(edge: float, points: Array, *more: Array) -> tuple[Array, ...]:
     """The mean in each occupied cube of some edge, m, of points (N, 3) and of what else there is of them (N, K)."""
-    cell = np.floor(points / edge).astype(np.int64)
-    which, count = np.unique(cell, axis=0, return_inverse=True, return_counts=True)[1:]
+    cell = np.floor(points / edge)
+    cell -= cell.min(axis=0)
+    span = cell.max(axis=0) + 1
+    # One number a cube is sorted five times as fast as three, as long as all such numbers are exact.
+    key = (cell[:, 0] * span[1] + cell[:, 1]) * span[2] + cell[:, 2] if np.prod(span) < 2**53 else cell
+    _, which, count = np.unique(key, axis=0, return_inverse=True, return_counts=True)
     which = which.reshape(-1)
     return tuple(
         np.stack([np.bincount(which, column) for column in array.T], axis=1) / count[:, None] for array in (points, *more)

@@ -34,7 +34,7 @@ from typing import Any
 
 from dapdata import durable, engines, manifest, recipe, remote, store, tasks, units
 from dapdata.engines import Failure, Job
-from dapdata.errors import EnvironmentProblem, FormatError, LockedError, QuarantineError, UsageError, require
+from dapdata.errors import EnvironmentProblem, FormatError, LockedError, QuarantineError, RejectedError, UsageError, require
 from dapdata.manifest import MissingEntry
 from dapdata.plan import Before, Cost, Plan, before, make_plan, measured_cost, missing
 from dapdata.recipe import Recipe
@@ -414,7 +414,7 @@ class _Command:
         tried = now.demos - sum(stop - start for start, stop in (entry.demo_range for entry in without))
         if sum(now.rejects.demos.values()) >= tried:
             reasons = ", ".join(f"{reason} {count}" for reason, count in now.rejects.demos.items())
-            raise UsageError(
+            raise RejectedError(
                 f"{self.root}: all {tried} demos were rejected ({reasons}), expected some that are not; "
                 f"{self.recipe.scene.remedy}"
             )

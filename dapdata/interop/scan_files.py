@@ -89,7 +89,7 @@ class About(Section):
     symmetry: Literal["none", "box", "revolution"] = key("none", "of the object: what turns nobody can tell apart")
     axis: Vector | None = key(None, "of a revolution, in the scan's frame at the start; null: up")
     opening: Vector | None = key(None, "out of the container, in the scan's frame at the start; null: up")
-    cameras: list[CameraAbout] = key([], "the cameras; `view` of a point is a place in this list")
+    cameras: list[CameraAbout] = key([], "the cameras; `view` of a point is a place in this list", max_length=64)
 
 
 @dataclass(frozen=True)

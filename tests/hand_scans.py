@@ -14,7 +14,7 @@ from dapdata.poses import pose, rotate, rotation_about, transform
 from dapdata.records import Array
 from dapdata.rng import stream
 
-STEP = 0.004  # m, of the grids of points
+STEP = 0.005  # m, of the grids of points
 NOISE = 0.0004  # m
 TRAY = (
     ((0.26, 0.18, 0.012), (0, 0, 0.006)),

@@ -42,7 +42,7 @@ TOLD = 10  # rejected demos of an import that are told one by one
 STOPPED, INTERRUPTED = "stopped; the same command, run again, goes on where it stopped", 130
 
 Net = Literal["both", "affordance", "pose"]
-Protocol = Literal["strict", "rpdiff"]
+Protocol = Literal["strict", "rpdiff", "shown"]
 Split = Literal["train", "val", "test"]
 
 
@@ -171,13 +171,27 @@ def _refusal(error: OSError) -> str:
 
 @app.command(epilog="Example: dapdata init can_cabinet --to recipes/mine.yaml")
 def init(
-    task: Annotated[str | None, typer.Argument(help="Name of a task; without it, the tasks are listed.")] = None,
+    task: Annotated[
+        str | None, typer.Argument(help="Name of a task, or `scans`; without it, the tasks are listed.", show_default=False)
+    ] = None,
+    folder: Annotated[
+        Path | None, typer.Argument(help="With `scans`: folder for example scans.", metavar="[DIR]", show_default=False)
+    ] = None,
     to: Annotated[Path | None, _option("--to", help="File to write", default="stdout", metavar="FILE")] = None,
 ) -> None:
-    """Write a commented starter recipe, or list the tasks."""
+    """Write a commented starter recipe, or example scans, or list the tasks."""
     from dapdata import tasks
     from dapdata.recipe import starter, summary
 
+    if task == "scans":
+        if folder is None or to is not None:
+            raise UsageError("init scans: no folder was named, expected one to write; run: dapdata init scans DIR")
+        from dapdata.imports import example_scans
+
+        print(example_scans(folder))
+        return
+    if folder is not None:
+        raise UsageError(f"init {task}: got a folder ({folder}), expected none; write the recipe to a file with --to FILE")
     if task is None:
         if to is not None:
             raise UsageError(f"--to {to}: no task was named, expected one of {', '.join(tasks.names())}")
@@ -654,6 +668,33 @@ def import_rpdiff(
     _import(asked, out, dry_run, as_json, **means)
 
 
+@imports.command("scans", epilog="Example: dapdata import scans scans --out data/scans")
+def import_scans(
+    source: Annotated[
+        Path, typer.Argument(help="Folder with a folder of scans for each demonstration; see `dapdata init scans`.")
+    ],
+    out: Out = None,
+    demos: Demos = None,
+    workers: Workers = None,
+    engine: Engine = "local",
+    memory: Memory = None,
+    allow_missing: AllowMissing = False,
+    overrides: Overrides = None,
+    dry_run: DryRun = False,
+    fresh: Fresh = False,
+    as_json: Json = False,
+) -> None:
+    """Your own scans, before and after. Where the object went is told by registration, or the demo is rejected."""
+    from dapdata.imports import agreement, scans_recipe
+
+    asked = scans_recipe(source, demos, overrides or ())
+    means = {"workers": workers, "engine": engine, "memory": memory, "allow_missing": allow_missing, "fresh": fresh}
+    _import(asked, out, dry_run, as_json, **means)
+    if not dry_run:
+        for line in agreement(asked, out):
+            say(line)
+
+
 def _import(asked: Any, out: str | None, dry_run: bool, as_json: bool, **means: Any) -> None:
     """Runs a recipe that imports, and says how many demos came in."""
     from dapdata import health
@@ -724,6 +765,18 @@ def export_scenes(
 ) -> None:
     """GLB and URDF of the true scenes. Container and clutter, the object, every goal as a frame."""
     _export("scenes", dataset, out, as_json, split=split, demos=demos)
+
+
+@exports.command("scans", epilog="Example: dapdata export scans data/fruit_rack --out scans")
+def export_scans(
+    out: Target,
+    dataset: LastDataset = None,
+    split: OneSplit = None,
+    demos: AtMost = None,
+    as_json: Json = False,
+) -> None:
+    """Simulated scans before and after, for `dapdata import scans`. With noise, partial views, and the truth beside them."""
+    _export("scans", dataset, out, as_json, split=split, demos=demos)
 
 
 @exports.command("rpdiff", epilog="Example: dapdata export rpdiff data/can_cabinet --out rpdiff/can_cabinet_chunked")

@@ -97,6 +97,28 @@ class RpdiffConfig(SceneConfig):
     )
 
 
+class ScansConfig(SceneConfig):
+    """Demonstrations that were scanned before and after, that are read instead of drawn."""
+
+    stages: ClassVar[str] = "dapdata.imports"
+    remedy: ClassVar[str] = "docs/import_scans.md tells what is behind each reason"
+    task: Literal["scans"] = "scans"
+    source: str = key("", "folder of the demonstrations, as it was named when they were imported")
+    source_sha256: str = key("", "of the names, sizes and samples of its files; another one is refused")
+    min_explained: float = key(
+        0.9, "share of the object's points after that its points before must explain, moved; larger: fewer, surer", ge=0.1, le=1
+    )
+    min_overlap: float = key(
+        0.4, "share of the object's points before that its points after must explain; larger: fewer, surer", ge=0.05, le=1
+    )
+    min_container: float = key(0.7, "share of the container's points after that those before must explain", ge=0.1, le=1)
+    align: bool = key(True, "camera poses are corrected where views overlap; needs K of cameras and the view of each point")
+    check_table: bool = key(True, "a cloud whose foot is much wider than all above is refused: it holds the table")
+
+
+IMPORTED: dict[str, type[SceneConfig]] = {"rpdiff": RpdiffConfig, "scans": ScansConfig}  # by what takes a task's place
+
+
 class SplitConfig(Section):
     """How demos are shared out; by container and object instance, so that no instance is in two splits."""
 
@@ -252,7 +274,7 @@ class EvalConfig(Section):
     trials: int = key(100, "demos of the split that are judged", ge=1)
     k: int = key(8, "candidates per demo that are ranked and judged", ge=1, le=1024)
     draws: int | None = key(None, "candidates per demo that the modes are counted on, at least k; null: k", ge=1, le=1024)
-    protocol: Literal["strict", "rpdiff"] = key("strict", "rules of the judge, see docs/metrics.md")
+    protocol: Literal["strict", "rpdiff", "shown"] = key("strict", "rules of the judge, see docs/metrics.md")
 
     @model_validator(mode="after")
     def check_draws(self) -> EvalConfig:

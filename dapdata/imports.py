@@ -12,18 +12,26 @@ A format is a section of the recipe (`recipe.IMPORTED`) and a reader (`READERS`)
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
-from dapdata import health, manifest, pipeline, recipe, remote
+import numpy as np
+
+from dapdata import health, manifest, pipeline, recipe, remote, store
+from dapdata.config import ScansConfig
 from dapdata.errors import UsageError
-from dapdata.interop import rpdiff_clouds, rpdiff_files, rpdiff_scenes
+from dapdata.interop import rpdiff_clouds, rpdiff_files, rpdiff_scenes, scan_clouds, scan_files, scan_placement
+from dapdata.interop import scans as scan_export
 from dapdata.plan import Plan
+from dapdata.poses import inverse, symmetric_distance
 from dapdata.recipe import Recipe
-from dapdata.records import Cloud, MeshDemo, Rejected
+from dapdata.records import Cloud, Demo, MeshDemo, Rejected, read_record
 from dapdata.remote import Place
 from dapdata.stages import Draw, Inputs, Sections, Stage
 
@@ -35,7 +43,10 @@ class Reader(NamedTuple):
     observe: Callable[[Any, Any, MeshDemo], Cloud | Rejected]  # (scene section, cameras section, what demonstrate gave)
 
 
-READERS = {"rpdiff": Reader(rpdiff_scenes.demonstrate, rpdiff_clouds.observe)}  # by the scene's `task`
+READERS = {  # by the scene's `task`
+    "rpdiff": Reader(rpdiff_scenes.demonstrate, rpdiff_clouds.observe),
+    "scans": Reader(scan_placement.demonstrate, scan_clouds.observe),
+}
 
 
 def _demonstrate(made: Inputs, sections: Sections, draw: Draw) -> MeshDemo | Rejected:
@@ -49,8 +60,8 @@ def _observe(made: Inputs, sections: Sections, draw: Draw) -> Cloud | Rejected:
 
 
 STAGES = (
-    Stage("demonstrate", 1, ("scene", "placement"), (), MeshDemo, _demonstrate, packages=("pybullet", "numpy")),
-    Stage("observe", 1, ("scene", "cameras"), ("demonstrate",), Cloud, _observe, packages=("numba", "numpy")),
+    Stage("demonstrate", 1, ("scene", "placement"), (), MeshDemo, _demonstrate, packages=("pybullet", "numpy", "scipy")),
+    Stage("observe", 1, ("scene", "cameras"), ("demonstrate",), Cloud, _observe, packages=("numba", "numpy", "scipy")),
     *pipeline.STAGES[2:],
 )
 parse = recipe.from_resolved
@@ -68,7 +79,25 @@ def rpdiff_recipe(source: Path, meshes: Path | None, demos: int | None, override
     return import_recipe(source, section, len(rpdiff_files.find(str(source))[0]), demos, overrides)
 
 
-def import_recipe(source: Path, section: Mapping[str, Any], found: int, demos: int | None, overrides: Sequence[str]) -> Recipe:
+def scans_recipe(source: Path, demos: int | None, overrides: Sequence[str]) -> Recipe:
+    """The recipe that imports scanned demonstrations, all of them or the first so many.
+
+    Raises:
+        FormatError: there are none.
+        RecipeError: an override that makes no sense.
+    """
+    section, found = scan_files.scene_section(str(source)), len(scan_files.find(str(source))[0])
+    return import_recipe(source, section, found, demos, overrides, {"eval": {"protocol": "shown"}})
+
+
+def import_recipe(
+    source: Path,
+    section: Mapping[str, Any],
+    found: int,
+    demos: int | None,
+    overrides: Sequence[str],
+    more: Mapping[str, Any] = MappingProxyType({}),
+) -> Recipe:
     """A recipe that imports, named after the file or folder.
 
     Args:
@@ -77,9 +106,10 @@ def import_recipe(source: Path, section: Mapping[str, Any], found: int, demos: i
         found: Demos in the source.
         demos: At most so many; None: all.
         overrides: As of `--set`.
+        more: Other sections.
     """
     name = re.sub(r"[^a-z0-9_-]+", "_", source.resolve().stem.lower()).strip("_-")[:64] or str(section["task"])
-    tree = {"name": name, "demos": min(found, demos or found), "scene": dict(section), **NO_NOISE}
+    tree = {"name": name, "demos": min(found, demos or found), "scene": dict(section), **NO_NOISE, **more}
     return recipe.from_resolved(tree, overrides, "import")
 
 
@@ -95,3 +125,76 @@ def run(asked: Recipe, out: Place | None, **options: Any) -> Place | Plan:
         first = health.rejected(place)[:1] if (place / manifest.MANIFEST).exists() else []
         shutil.rmtree(place)
         raise UsageError("; ".join([str(error), *(f"demo {told['demo']}: {told['detail']}" for told in first)])) from error
+
+
+# Scans -----------------------------------------------------------------------------------------------------
+
+EXAMPLE = {  # small images, so that the example is a few MB
+    "name": "example_scans",
+    "demos": 3,
+    "scene": {"task": "fruit_rack"},
+    "cameras": {
+        "width": 320,
+        "height": 180,
+        "vfov_deg": 42.0,
+        "container_views": 2,
+        "container_yaw_spread_deg": 90.0,
+        "container_distance": 0.7,
+        "container_pitch_deg": 40.0,
+        "object_views": 2,
+        "object_distance": 0.5,
+        "object_view_scale": 1.0,
+    },
+}
+WRONG_MM, WRONG_DEG = 10.0, 20.0  # a placement that is farther from the truth is another one
+
+
+def example_scans(out: Path) -> Path:
+    """Writes three scanned demonstrations, simulated, that `import scans` takes as they are; the folder.
+
+    Raises:
+        UsageError: the folder holds something else.
+        MissingExtraError: what simulates is not installed.
+    """
+    with TemporaryDirectory() as folder:
+        dataset = Path(folder) / "example_scans"
+        pipeline.generate(recipe.from_resolved(EXAMPLE, (), "example"), dataset, workers=1, engine="inline")
+        pipeline.label(dataset, workers=1, engine="inline")
+        return scan_export.export(dataset, out)
+
+
+def agreement(asked: Recipe, out: Place | None) -> Iterator[str]:
+    """A line that says how far placements that were told from scans are from their `truth.json`; none where there is none."""
+    config = asked.scene
+    assert isinstance(config, ScansConfig)
+    off = []
+    for demo, found in _imported(asked, out):
+        path = scan_files.folder_of(config, demo) / scan_export.TRUTH
+        if path.is_file():
+            truth = json.loads(path.read_bytes())
+            T_start, T_shown = (np.array(truth[f"T_world_object_{name}"]) for name in ("start", "goal"))
+            T_goal = found.T_world_object_goal @ inverse(found.T_world_object_start) @ T_start
+            off.append(symmetric_distance(T_goal, T_shown, truth["symmetry"], np.array(truth["axis"])))
+    if off:
+        shift, turn = 1000 * np.array(off)[:, 0], np.degrees(off)[:, 1]
+        wrong = int(((shift > WRONG_MM) | (turn > WRONG_DEG)).sum())
+        yield (
+            f"against {scan_export.TRUTH}, {len(off)} demos: "
+            f"{np.median(shift):.1f} mm median, {np.quantile(shift, 0.9):.1f} p90; "
+            f"{np.median(turn):.1f} deg median, {np.quantile(turn, 0.9):.1f} p90 modulo symmetry; {wrong} off by more than "
+            f"{WRONG_MM:.0f} mm or {WRONG_DEG:.0f} deg"
+        )
+
+
+def _imported(asked: Recipe, out: Place | None) -> Iterator[tuple[int, Demo]]:
+    """Number and record of each demo that came in; none where nothing was published, or far away."""
+    root = remote.locate(out or Path("data") / asked.name)
+    if not isinstance(root, Path) or not (root / manifest.MANIFEST).is_file():
+        return
+    stages = manifest.read(root).stages
+    seen = {row["demo"] for unit in stages["observe"].units for row in store.read_record(root / unit.path)["rows"]}
+    for unit in stages["demonstrate"].units:
+        block = store.read_block(root / unit.path)
+        for i, row in enumerate(store.read_record(root / unit.path)["rows"]):
+            if row["demo"] in seen:
+                yield row["demo"], read_record(MeshDemo, block.sample(i))

@@ -7,14 +7,15 @@ to choose. Definitions in docs/metrics.md.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from math import comb, log
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dapdata.records import GOAL_KINDS, PART_KINDS, Mesh
+from dapdata.poses import inverse, transform
+from dapdata.records import GOAL_KINDS, PART_KINDS, Mesh, meshes_in
 
 Array = NDArray[Any]
 
@@ -52,6 +53,14 @@ def hull_points(kind: Array, size: Array, T_object_part: Array, meshes: Sequence
             local = (rims if PART_KINDS[int(k)] == "cylinder" else corners) * extents
         points.append(local @ T[:3, :3].T + T[:3, 3])
     return np.concatenate(points)
+
+
+def object_points(sample: Mapping[str, Array]) -> Array:
+    """(X, 3) points around a demo's object, its own frame, m: of its parts, or of its cloud where nobody knows them."""
+    if not len(sample["object_parts/kind"]):
+        return transform(inverse(sample["pose/T_world_object_start"]), sample["object/points"].astype(float))
+    kind, size, T_object_part = (sample[f"object_parts/{name}"] for name in ("kind", "size", "T_object_part"))
+    return hull_points(kind, size, T_object_part, meshes_in(sample)[1])
 
 
 def surface_distance(T_a: Array, T_b: Array, points: Array, symmetry: str, axis: Array) -> Array:

@@ -28,10 +28,10 @@ from dapdata import rng as rngs
 from dapdata.errors import CorruptionError, UsageError
 from dapdata.matching import (
     assign,
-    hull_points,
     is_tight,
     legacy_rpdiff,
     mode_entropy,
+    object_points,
     surface_distance,
     tolerance,
     uniform_all_found,
@@ -40,7 +40,7 @@ from dapdata.matching import (
 )
 from dapdata.poses import symmetric_distance
 from dapdata.predictions import Predictions, collect, read
-from dapdata.records import SYMMETRIES, Demo, Placement, Verdict, meshes_of, read_demo
+from dapdata.records import SYMMETRIES, Demo, Placement, Verdict, read_demo
 from dapdata.report import (
     Affordance,
     Cost,
@@ -68,7 +68,7 @@ __all__ = ["Report", "compare", "judge_dataset", "judge_file", "require_sound", 
 
 Array = NDArray[Any]
 Sample = Mapping[str, Array]
-Protocol = Literal["strict", "rpdiff"]
+Protocol = Literal["strict", "rpdiff", "shown"]
 
 NEAR_GOAL = 0.02  # m, largest surface distance to a verified goal
 PRECISE_MOVE, PRECISE_TURN = 0.005, np.deg2rad(3.0)  # from the prediction to where it came to rest
@@ -77,6 +77,7 @@ COUNTS = (1, 2, 4, 8, 16, 32)  # K at which modes are counted
 SWEEP = (2, 5, 10, 20, 35)  # mm
 CLEARANCES = (0, 5, 10, 15, 30, np.inf)  # mm: success is counted for goals between two of them, the lower included
 NO_PREDICTION = "no_prediction"
+FAR = "far_from_shown"  # protocol shown: more than NEAR_GOAL from each recorded goal
 SOUND = 0.98  # an oracle below this means a broken judge or broken demonstrations
 
 
@@ -148,28 +149,33 @@ class SceneResult:
 
 
 def judge_scene(
-    demo: Demo, T_world_object: Array, rank: Array, k: int, placement: PlacementConfig, protocol: Protocol
+    demo: Demo, points: Array, T_world_object: Array, rank: Array, k: int, placement: PlacementConfig, protocol: Protocol
 ) -> SceneResult:
     """The judge's verdicts on the k best candidates of one scene, and the distances of all to its goals.
 
     Args:
         demo: The scene.
+        points: (X, 3) of the object's surface, its own frame, m; see matching.object_points.
         T_world_object: (C, 4, 4) candidates by rank; C may be 0.
         rank: (C,) rising; those below k are judged.
         k: Candidates that are judged.
         placement: The judge's parameters, from the dataset's recipe.
-        protocol: "strict" or "rpdiff".
-    """
-    from dapdata import simulate
+        protocol: "strict" or "rpdiff", in physics; or "shown", near a recorded goal.
 
-    start = time.perf_counter()
-    judged = T_world_object[rank < k]
-    verdicts = list(simulate.judge(demo, judged, placement, protocol)) if len(judged) else []
-    seconds = time.perf_counter() - start
+    Raises:
+        UsageError: physics is asked for where nobody knows the shapes.
+    """
     symmetry, axis = SYMMETRIES[int(demo.symmetry_kind)], np.asarray(demo.symmetry_axis, float)
-    points = hull_points(demo.object_kind, demo.object_size, demo.T_object_part, meshes_of(demo)[1])
     distance = surface_distance(T_world_object, demo.goals, points, symmetry, axis)
-    nearest = [symmetric_distance(T, demo.goals[g], symmetry, axis) for T, g in zip(T_world_object, distance.argmin(axis=1))]
+    goal = demo.goals[distance.argmin(axis=1)]
+    nearest = [symmetric_distance(T, T_goal, symmetry, axis) for T, T_goal in zip(T_world_object, goal)]
+    start, judged = time.perf_counter(), rank < k
+    if protocol == "shown":
+        rows = zip(goal[judged], distance[judged].min(axis=1, initial=np.inf), np.array(nearest).reshape(-1, 2)[judged])
+        verdicts = [_as_shown(T, float(off), *map(float, near)) for T, off, near in rows]
+    else:
+        verdicts = _in_physics(demo, T_world_object[judged], placement, protocol)
+    seconds = time.perf_counter() - start
     return SceneResult(
         int(demo.demo),
         T_world_object,
@@ -183,6 +189,25 @@ def judge_scene(
         legacy_rpdiff(T_world_object, demo.goals),
         demo.goal_clearance,
     )
+
+
+def _in_physics(
+    demo: Demo, T_world_object: Array, placement: PlacementConfig, protocol: Literal["strict", "rpdiff"]
+) -> list[Verdict]:
+    from dapdata import simulate
+
+    if not len(demo.part_kind) or not len(demo.object_kind):
+        raise UsageError(
+            f"protocol: got '{protocol}', expected shown: demo {int(demo.demo)} was imported without shapes, there is nothing "
+            "to simulate; use --protocol shown, or --data with simulated scenes"
+        )
+    return list(simulate.judge(demo, T_world_object, placement, protocol)) if len(T_world_object) else []
+
+
+def _as_shown(T_goal: Array, off: float, shift: float, turn: float) -> Verdict:
+    """The verdict without physics: near the recorded goal (4, 4), which stands for where it comes to rest, or not."""
+    is_near = off <= NEAR_GOAL
+    return Verdict(is_near, "ok" if is_near else FAR, T_goal, shift, turn, push=np.nan, penetration=np.nan, gap=np.nan)
 
 
 def judge_all(
@@ -201,13 +226,15 @@ def judge_all(
         predictions: Candidates; those of other demos are left alone.
         samples: One demo each, arrays by shard path.
         placement: The judge's parameters.
-        protocol: "strict" or "rpdiff".
+        protocol: "strict", "rpdiff" or "shown".
         k: Candidates that are judged: those whose rank is less.
         workers: Processes.
         progress: Called once a scene.
     """
-    demos = [read_demo(sample) for sample in samples]
-    jobs = [(demo, predictions.of(int(demo.demo)), predictions.ranks(int(demo.demo)), k, placement, protocol) for demo in demos]
+    jobs = []
+    for sample in samples:
+        demo, number = read_demo(sample), int(sample["meta/demo"])
+        jobs.append((demo, object_points(sample), predictions.of(number), predictions.ranks(number), k, placement, protocol))
     results = []
     for result in _run(jobs, workers):
         results.append(result)
@@ -216,7 +243,9 @@ def judge_all(
     return results
 
 
-def _run(jobs: Sequence[tuple[Demo, Array, Array, int, PlacementConfig, Protocol]], workers: int) -> Iterator[SceneResult]:
+def _run(
+    jobs: Sequence[tuple[Demo, Array, Array, Array, int, PlacementConfig, Protocol]], workers: int
+) -> Iterator[SceneResult]:
     if workers <= 1 or len(jobs) < 2:
         yield from (judge_scene(*job) for job in jobs)
         return
@@ -345,7 +374,9 @@ def _geometry(results: Sequence[SceneResult]) -> Geometry:
     return Geometry(
         penetration_mm=quantiles(np.array([max(v.penetration, 0.0) for v in top if np.isfinite(v.penetration)]) * 1000),
         gap_mm=quantiles(np.array([v.gap for v in top]) * 1000),
-        collision_free=rate(np.array([bool(r.verdicts) and r.verdicts[0].penetration <= FREE for r in results])),
+        collision_free=rate(
+            np.array([bool(r.verdicts) and r.verdicts[0].penetration <= FREE for r in results if _has_physics(r)])
+        ),
         goal_surface_mm=quantiles(np.array([r.distance[0].min() for r in with_top]) * 1000),
         goal_translation_mm=quantiles(np.array([r.nearest[0, 0] for r in with_top]) * 1000),
         goal_rotation_deg=quantiles(np.rad2deg([r.nearest[0, 1] for r in with_top])),
@@ -353,6 +384,11 @@ def _geometry(results: Sequence[SceneResult]) -> Geometry:
         settle_turn_deg=quantiles(np.rad2deg([v.turned for v in top])),
         push_N=quantiles(np.array([v.push for v in top])),
     )
+
+
+def _has_physics(result: SceneResult) -> bool:
+    """Whether overlaps were measured, or would have been, had there been a candidate."""
+    return not result.verdicts or not np.isnan(result.verdicts[0].penetration)
 
 
 def judge_file(
@@ -368,7 +404,7 @@ def judge_file(
     Args:
         predictions: An npz as `predictions` describes it.
         dataset: Folder or URL of the dataset, or the opened split.
-        protocol: "strict" or "rpdiff".
+        protocol: "strict", "rpdiff" or "shown".
         split: Which scenes; ignored when the dataset is an opened split.
         options: Passed on to `judge_dataset`.
 
@@ -411,7 +447,7 @@ def judge_dataset(
     Args:
         predictions: Candidates for scenes of the split; judged scenes without any are failures.
         dataset: The opened split.
-        protocol: "strict" or "rpdiff".
+        protocol: "strict", "rpdiff" or "shown".
         split: Name of the split.
         trials: Judge the first so many scenes of the split; all when None.
         k: Candidates of a scene that are judged; the largest rank + 1, and so all, when None.
@@ -465,7 +501,7 @@ def judge_dataset(
         ),
         judge=Judge(
             protocol=protocol,
-            engine=_engine(),
+            engine="none" if protocol == "shown" else _engine(),
             dapdata=__version__,
             placement=placement.model_dump(mode="json"),
             oracle=oracle_rate,

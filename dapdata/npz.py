@@ -77,7 +77,7 @@ def read_array(file: IO[bytes], size: int) -> Array:
     if version not in readers:
         raise ValueError(f"got npy version {version}, expected 1.0 or 2.0")
     shape, fortran, dtype = readers[version](file)
-    if dtype.hasobject or dtype.kind not in "iufU" or not 0 < dtype.itemsize <= MAX_ITEM:
+    if dtype.hasobject or dtype.kind not in "biufU" or not 0 < dtype.itemsize <= MAX_ITEM:
         raise ValueError(f"got {dtype}, expected plain numbers or text; nothing is unpickled")
     count = 1
     for length in shape:  # Python integers: a numpy product would overflow on a lying header

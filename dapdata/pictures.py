@@ -32,7 +32,7 @@ from dapdata.draw import (
     splat,
     triangulate,
 )
-from dapdata.matching import hull_points
+from dapdata.matching import object_points
 from dapdata.poses import facing, inverse, rotate, transform
 
 Array = NDArray[Any]
@@ -74,19 +74,10 @@ def front_view(sample: Sample, width: int, height: int) -> Camera:
     """The camera in front of the container, a little aside and above, with the container and its goals in the picture."""
     out = facing(sample["pose/T_world_container"], sample["scene/opening"])
     aside = np.array([out[1], -out[0], 0.0])  # to the viewer's left of the opening's direction
-    placed = [transform(T_world_object, _object_points(sample)) for T_world_object in sample["goals/T_world_object"]]
+    placed = [transform(T_world_object, object_points(sample)) for T_world_object in sample["goals/T_world_object"]]
     return frame(
         np.concatenate([sample["container/points"], *placed]).astype(float), out - SIDE * aside + [0, 0, ABOVE], width, height
     )
-
-
-def _object_points(sample: Sample) -> Array:
-    """(X, 3) points around the object, its own frame, m: of its parts, or of its cloud where nobody knows them."""
-    if not len(sample["object_parts/kind"]):
-        return transform(inverse(sample["pose/T_world_object_start"]), sample["object/points"].astype(float))
-    parts = (sample[f"object_parts/{name}"] for name in ("kind", "size", "T_object_part"))
-    kind, size, T_object_part = parts
-    return hull_points(kind, size, T_object_part, records.meshes_in(sample)[1])
 
 
 def draw_scene(canvas: Canvas, sample: Sample) -> None:

@@ -10,6 +10,7 @@ Symmetry kinds (`records.SYMMETRIES`), each a group acting on the object frame f
 
 from __future__ import annotations
 
+from itertools import permutations, product
 from math import cos, hypot, sin
 from typing import Any
 
@@ -157,3 +158,14 @@ def facing(T_world_container: Array, opening: Array) -> Array:
     """
     level = np.array([opening[0], opening[1], 0.0]) if np.hypot(*opening[:2]) > 1e-6 else np.array([1.0, 0, 0])
     return np.asarray(T_world_container[:3, :3] @ (level / np.linalg.norm(level)))
+
+
+def upright_turn(rotation: Array) -> Array:
+    """(3, 3) right-angle turn after which the z axis of a rotation (3, 3) is closest to up: rotation @ turn.
+
+    Of four such the one closest to none.
+    """
+    signed = [np.eye(3)[:, order] * signs for order in permutations(range(3)) for signs in product((1.0, -1.0), repeat=3)]
+    turns = [turn for turn in signed if np.linalg.det(turn) > 0]
+    up = [round(float((rotation @ turn)[2, 2]), 6) for turn in turns]
+    return turns[max(range(len(turns)), key=lambda i: (up[i], np.trace(turns[i]), -i))]

@@ -18,14 +18,13 @@ from pydantic import BaseModel, Field, SerializeAsAny, ValidationError, create_m
 
 from dapdata import keys, tasks
 from dapdata.cluster import SuperpointsConfig
-from dapdata.config import PAPER, EvalConfig, RpdiffConfig, SceneConfig, Section, SplitConfig, TrainConfig, key
+from dapdata.config import IMPORTED, PAPER, EvalConfig, SceneConfig, Section, SplitConfig, TrainConfig, key
 from dapdata.errors import UsageError, hint
 from dapdata.labels import LabelConfig
 from dapdata.observe import CamerasConfig, NoiseConfig
 from dapdata.simulate import PlacementConfig
 from dapdata.strict_yaml import Location, Source
 
-IMPORTED = {"rpdiff": RpdiffConfig}  # what is read from files, by what takes a task's place
 NAME_PATTERN = r"^[a-z0-9][a-z0-9_-]*$"
 
 
@@ -79,7 +78,7 @@ def from_resolved(resolved: dict[str, Any], overrides: Sequence[str] = (), origi
 @cache
 def recipe_class(task: str) -> type[Recipe]:
     """The Recipe whose scene section is that of the task; the task must be one of `tasks.names()` or `IMPORTED`."""
-    params = IMPORTED[task] if task in IMPORTED else tasks.load(task).Params
+    params: Any = IMPORTED[task] if task in IMPORTED else tasks.load(task).Params
     scene = Field(default=params(), description=Recipe.model_fields["scene"].description)
     return create_model("Recipe", __base__=Recipe, __doc__=Recipe.__doc__, scene=(params, scene))
 

@@ -40,6 +40,7 @@ GOAL_KINDS = (
     "hole",
     "settled",  # imported: settled here, and what it rests on is not told
     "commanded",  # imported: a pose as it was commanded; without meshes, nothing was settled
+    "shown",  # imported: where a scan saw it placed; there are no shapes to settle
 )
 REJECT_REASONS = (
     "penetrates",  # overlaps the container or clutter by more than placement.max_penetration

@@ -158,7 +158,7 @@ class Digests(Part):
 class Judge(Part):
     """Who judged, by which rules."""
 
-    protocol: Literal["strict", "rpdiff"]
+    protocol: Literal["strict", "rpdiff", "shown"]
     engine: str
     dapdata: str
     placement: dict[str, Any]

@@ -20,7 +20,7 @@ DAPTRAIN = sorted((ROOT / "train/daptrain").rglob("*.py"))
 LINES = (
     ("errors", "rng", "poses", "config"),
     ("records", "strict_yaml", "durable", "npz", "chunks", "console"),
-    ("solids", "keys", "slic", "split", "matching", "tables", "buckets", "sense", "clouds"),
+    ("solids", "registration", "keys", "slic", "split", "matching", "tables", "buckets", "sense", "clouds"),
     ("meshes", "tabletop"),
     ("tasks",),
     ("simulate", "observe", "cluster", "labels"),

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dapdata.clouds import read_cloud, write_ply
+from dapdata.clouds import read_cloud, read_points, thin, write_ply
 from dapdata.errors import FormatError
 from dapdata.records import Array
 
@@ -91,3 +91,49 @@ def test_a_pickled_array_is_never_loaded(tmp_path: Path) -> None:
 def test_a_missing_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(FormatError, match=r"gone\.ply: cannot be read"):
         read_cloud(tmp_path / "gone.ply")
+
+
+def test_labels_and_views_are_read_where_there_are_any_and_normals_may_be_missing(tmp_path: Path) -> None:
+    write_ply(tmp_path / "a.ply", POINTS, label=np.array([0, 1, 2]), view=np.array([3, 3, 0]))
+    np.savez(tmp_path / "a.npz", points=POINTS, label=np.array([0, 1, 2]), view=np.array([3, 3, 0]))
+    for name in ("a.ply", "a.npz"):
+        found = read_points(tmp_path / name)
+        np.testing.assert_allclose(found.points, POINTS, atol=1e-7)
+        assert found.normals is None
+        assert found.label is not None
+        assert found.view is not None
+        assert (found.label.tolist(), found.view.tolist()) == ([0, 1, 2], [3, 3, 0])
+    with pytest.raises(FormatError, match=r"a\.ply: has no nx ny nz, expected x y z nx ny nz"):
+        read_cloud(tmp_path / "a.ply")
+
+
+def test_pixels_without_depth_are_left_out(tmp_path: Path) -> None:
+    rows = ROWS.copy()
+    rows[1] = np.nan
+    (tmp_path / "a.pcd").write_bytes(f"{PCD}binary\n".encode() + rows.astype("<f4").tobytes())
+    found = read_points(tmp_path / "a.pcd")
+    np.testing.assert_allclose(found.points, POINTS[[0, 2]], atol=1e-7)
+    assert found.normals is not None
+    assert len(found.normals) == 2
+
+
+def test_labels_that_are_not_whole_are_refused(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", points=POINTS, label=np.array([0, 0.5, 1]))
+    with pytest.raises(FormatError, match="label: has numbers that are not whole"):
+        read_points(tmp_path / "a.npz")
+
+
+def test_a_text_cloud_that_would_fill_the_memory_is_refused_by_its_header(tmp_path: Path) -> None:
+    (tmp_path / "a.ply").write_bytes(ply("ascii", text(ROWS), 4_000_000))
+    with pytest.raises(FormatError, match="4000000 points as text, expected 1666666 at the most; save it as binary"):
+        read_points(tmp_path / "a.ply")
+
+
+@pytest.mark.parametrize("far", [0.0, 1e7])
+def test_thinning_takes_the_mean_of_each_cube_however_far_points_are_apart(far: float) -> None:
+    points = np.array([[0.1, 0.1, 0.1], [far, far, far + 0.95], [0.3, 0.1, 0.5]])
+    mean, values = thin(1.0, points, np.array([[1.0], [2.0], [3.0]]))
+    expected = {(0.2, 0.1, 0.3): 2.0} if far else {tuple(points.mean(axis=0).round(9)): 2.0}
+    found = dict(zip(map(tuple, mean.round(9)), values[:, 0].tolist()))
+    assert found.items() >= expected.items()
+    assert len(found) == (2 if far else 1)

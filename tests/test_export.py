@@ -18,7 +18,7 @@ import pytest
 
 from dapdata import cli, durable, loading, manifest, pictures, pipeline, records, solids
 from dapdata.errors import LockedError, UsageError
-from dapdata.interop import export, parquet, pointcept, rpdiff, scenes, webdataset
+from dapdata.interop import export, parquet, pointcept, rpdiff, scans, scenes, webdataset
 from dapdata.loading import Dataset
 from dapdata.poses import pose, random_rotation, rotation_about
 from dapdata.records import Array
@@ -30,6 +30,7 @@ EXPORTS: dict[str, Callable[..., Path]] = {
     "pointcept": pointcept.export,
     "scenes": scenes.export,
     "rpdiff": rpdiff.export,
+    "scans": scans.export,
 }
 QUICK: dict[str, dict[str, Any]] = {  # options that make small files quickly
     "webdataset": {"shard_size": 2},
@@ -37,8 +38,9 @@ QUICK: dict[str, dict[str, Any]] = {  # options that make small files quickly
     "pointcept": {},
     "scenes": {},
     "rpdiff": {"shard_size": 2},
+    "scans": {},
 }
-SUFFIXES = (".tar", ".parquet", ".npy", ".glb", ".npz")
+SUFFIXES = (".tar", ".parquet", ".npy", ".glb", ".npz", ".ply")
 every_format = pytest.mark.parametrize("format", EXPORTS)
 
 

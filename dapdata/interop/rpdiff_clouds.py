@@ -17,9 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dapdata.config import RpdiffConfig
+from dapdata.interop.normals import by_camera, estimated_normals, project
 from dapdata.interop.rpdiff_files import Bodies, Fault, Raw, check, on_table, own, read_fields, rejected
 from dapdata.observe import CamerasConfig
-from dapdata.poses import inverse, pose, rotate, transform
+from dapdata.poses import pose, rotate, transform
 from dapdata.records import Cloud, Demo, Rejected
 
 Array = NDArray[Any]
@@ -27,9 +28,6 @@ Array = NDArray[Any]
 ON_PIXEL = 1e-3  # px: points of a depth image are projected back onto its pixels to less than this
 HALF_PIXEL = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])  # px, added to intrinsics
 MAX_IMAGE = 4096  # px
-CELLS = 3.0  # spacings of the points: edge of the cells of depth images by which cameras are found for points on no pixel
-BEHIND = 0.005  # m: what is this far behind the front of its cell is seen a third as well
-NEIGHBOURS = 16  # points to whose plane a normal is square, where there are no depth images
 
 
 def observe(config: RpdiffConfig, cameras: CamerasConfig, demo: Demo) -> Cloud | Rejected:
@@ -89,7 +87,7 @@ def _depth_views(points: Array, raw: Raw, config: RpdiffConfig) -> list[tuple[Ar
 
     if not len(raw.K):
         return None
-    seen = [_project(points, K, T) for K, T in zip(raw.K, raw.T_world_camera)]
+    seen = [project(points, K, T) for K, T in zip(raw.K, raw.T_world_camera)]
     for corner in (0.0, 0.5):
         off = np.stack([np.abs(uv - corner - np.round(uv - corner)).max(axis=1) for uv, _ in seen])
         valid = np.stack([(z > 0) & ((uv > -0.5) & (uv < MAX_IMAGE)).all(axis=1) for uv, z in seen])
@@ -111,13 +109,6 @@ def _depth_views(points: Array, raw: Raw, config: RpdiffConfig) -> list[tuple[Ar
     return views
 
 
-def _project(points: Array, K: Array, T_world_camera: Array) -> tuple[Array, Array]:
-    """(N, 2) px and (N,) depth, m, of points in a camera."""
-    local = transform(inverse(T_world_camera), points)
-    z = np.where(np.abs(local[:, 2]) < 1e-9, 1e-9, local[:, 2])
-    return local[:, :2] / z[:, None] * K[[0, 1], [0, 1]] + K[:2, 2], local[:, 2]
-
-
 def _by_camera(points: Array, normals: Array | None, raw: Raw) -> list[tuple[Array, Array]]:
     """Points and normals toward the sensor by the camera that sees them most squarely; all in one where there are none."""
     if normals is not None:
@@ -129,47 +120,9 @@ def _by_camera(points: Array, normals: Array | None, raw: Raw) -> list[tuple[Arr
         if normals is None:
             raise Fault("no_normals")
         return [(points, normals)]
-    normals = _estimated_normals(points) if normals is None else normals
-    cell = CELLS * _spacing(points)
-    facing = np.stack([_facing(points, normals, K, T, cell) for K, T in zip(raw.K, raw.T_world_camera)])
-    owner = np.abs(facing).argmax(axis=0)
-    toward = np.where(facing[owner, np.arange(len(points))] < 0, -1.0, 1.0)[:, None] * normals
+    if normals is None:
+        if len(points) < 3:
+            raise Fault("no_normals")
+        normals = estimated_normals(points)
+    owner, toward = by_camera(points, normals, raw.K, raw.T_world_camera)
     return [(points[owner == v], toward[owner == v]) for v in range(len(raw.K))]
-
-
-def _spacing(points: Array) -> float:
-    """m, from one point to the next, in the median."""
-    from scipy.spatial import cKDTree
-
-    return float(np.median(cKDTree(points).query(points[:: max(1, len(points) // 1000)], 2)[0][:, 1])) or 1e-3
-
-
-def _facing(points: Array, normals: Array, K: Array, T_world_camera: Array, edge: float) -> Array:
-    """(N,) cosine between normals and the way to a camera, less for points that something is in front of.
-
-    Args:
-        points, normals: (N, 3).
-        K, T_world_camera: (3, 3) and (4, 4) of the camera.
-        edge: Of the cells in which the front is sought, m, at the middle of the points.
-    """
-    uv, z = _project(points, K, T_world_camera)
-    pixels = max(edge * K[0, 0] / max(float(np.median(z)), 1e-3), 1e-3)
-    cell = np.unique(np.floor(uv / pixels).astype(np.int64), axis=0, return_inverse=True)[1].reshape(-1)
-    front = np.full(cell.max() + 1, np.inf)
-    np.minimum.at(front, cell, np.where(z > 0, z, np.inf))
-    way = T_world_camera[:3, 3] - points
-    cosine = np.einsum("ij,ij->i", normals, way) / np.linalg.norm(way, axis=1)
-    in_view = (z > 0) & ((uv > 0) & (uv < 2 * K[:2, 2])).all(axis=1)
-    behind = np.where(in_view, z - np.minimum(front[cell], 1e3), np.inf)
-    return np.asarray(cosine * np.maximum(np.exp(-behind / BEHIND), 1e-6))
-
-
-def _estimated_normals(points: Array) -> Array:
-    """(N, 3) unit normals of the planes through the nearest points, looking either way."""
-    from scipy.spatial import cKDTree
-
-    if len(points) < 3:
-        raise Fault("no_normals")
-    near = cKDTree(points).query(points, min(NEIGHBOURS, len(points)))[1]
-    around = points[near] - points[near].mean(axis=1, keepdims=True)
-    return np.asarray(np.linalg.eigh(np.einsum("nki,nkj->nij", around, around))[1][:, :, 0])

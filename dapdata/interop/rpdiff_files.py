@@ -108,7 +108,7 @@ def find(source: str) -> tuple[tuple[Place, ...], str]:
     root = Path(source)
     if not root.exists():
         raise FormatError(f"{root}: no such file or folder, expected demos of RPDiff (demo_aug_*.npz); check the path")
-    files = [root] if root.is_file() else sorted(_below(root, (".npz",)), key=_natural)
+    files = [root] if root.is_file() else sorted(_below(root, (".npz",)), key=natural)
     files = [file for file in files if SLOTS not in file.name]
     places, whole, recognised = list[Place](), sha256(), False
     for file in files:
@@ -146,7 +146,7 @@ def _is_inside(path: Path, root: Path) -> bool:
     return path.is_file() and path.resolve().is_relative_to(root.resolve())
 
 
-def _natural(path: Path) -> tuple[Any, ...]:
+def natural(path: Path) -> tuple[Any, ...]:
     """Numbers in names count as numbers."""
     return tuple((int(word), "") if word.isdecimal() else (-1, word) for word in re.split(r"(\d+)", path.as_posix()))
 
@@ -181,7 +181,7 @@ def mesh_folder(folder: str) -> MeshFolder:
         raise FormatError(f"{root}: no such folder, expected meshes ({', '.join(meshes.SUFFIXES)}); check --meshes")
     found: dict[str, tuple[Path, ...]] = {}
     whole = sha256()
-    for path in sorted(_below(root, (*meshes.SUFFIXES, *SLOT_SUFFIXES)), key=_natural):
+    for path in sorted(_below(root, (*meshes.SUFFIXES, *SLOT_SUFFIXES)), key=natural):
         if _is_inside(path, root):
             found[path.name] = (*found.get(path.name, ()), path)
             whole.update(durable.canonical([path.relative_to(root).as_posix(), durable.hash_file(path)]))

@@ -12,11 +12,10 @@ fitting the scale of books and cans (it is not stored, within 0.5 %); only meshe
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import fields, replace
 from functools import lru_cache
 from hashlib import sha256
-from itertools import permutations, product
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +39,7 @@ from dapdata.interop.rpdiff_files import (
     read_fields,
     rejected,
 )
-from dapdata.poses import inverse, pose, rotation_about, symmetric_distance, transform
+from dapdata.poses import inverse, pose, rotation_about, symmetric_distance, transform, upright_turn
 from dapdata.records import (
     GOAL_KINDS,
     REJECT_REASONS,
@@ -286,20 +285,8 @@ def _level(T_world: Array) -> Array:
 
 
 def _upright_frame(raw: Raw, middle: Array) -> Array:
-    """(4, 4) T_theirs_object: our object frame, whose origin is the middle of the mesh and whose z axis is up at the goal.
-
-    Of the turns by right angles the one that brings z closest to up, and of four such the one closest to none.
-    """
-    turns = [R for R in _right_angle_turns() if np.linalg.det(R) > 0]
-    up = [round(float((raw.T_world_final[:3, :3] @ R)[2, 2]), 6) for R in turns]
-    best = max(range(len(turns)), key=lambda i: (up[i], np.trace(turns[i]), -i))
-    return pose(turns[best], middle)
-
-
-def _right_angle_turns() -> Iterator[Array]:
-    for order in permutations(range(3)):
-        for signs in product((1.0, -1.0), repeat=3):
-            yield np.eye(3)[:, order] * signs
+    """(4, 4) T_theirs_object: our object frame, whose origin is the middle of the mesh and whose z axis is up at the goal."""
+    return pose(upright_turn(raw.T_world_final[:3, :3]), middle)
 
 
 def _is_called(name: str, words: Sequence[str]) -> bool:

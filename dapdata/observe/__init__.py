@@ -127,7 +127,7 @@ def _look(
     clouds = []
     for view in views:
         T_camera_part = inverse(view.T_world_camera_true) @ T_world_part
-        image = _image(view, kind, size, meshes, T_camera_part, cameras)
+        image = image_of(view, kind, size, meshes, T_camera_part, cameras)
         clouds.append(view_cloud(add_noise(image, view.K, noise.preset, view.noise_seed), view))
     points, normals = [points for points, _ in clouds], [normals for _, normals in clouds]
     T_world_camera = np.stack([view.T_world_camera for view in views])
@@ -136,7 +136,7 @@ def _look(
     return fuse(points, normals, T_world_camera, voxel), T_world_camera
 
 
-def _image(
+def image_of(
     view: View, kind: Array, size: Array, meshes: list[Mesh | None], T_camera_part: Array, cameras: CamerasConfig
 ) -> Image:
     """What the view sees of parts of any kind."""

@@ -88,10 +88,10 @@ def _view(
     )
     width, height = round(cameras.width * scale), round(cameras.height * scale)
     K = intrinsics(width, height, cameras.vfov_deg)
-    return View(width, height, K, believed, believed @ _pose_error(noise, error), noise_seed)
+    return View(width, height, K, believed, believed @ pose_error(noise, error), noise_seed)
 
 
-def _pose_error(noise: NoiseConfig, normal: Array) -> Array:
+def pose_error(noise: NoiseConfig, normal: Array) -> Array:
     """(4, 4) T_believed_true from six standard normals: translation along, then rotation about the camera's axes."""
     preset = PRESETS[noise.preset]
     translation = preset.camera_translation if noise.camera_translation is None else noise.camera_translation

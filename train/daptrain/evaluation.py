@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from dapdata import loading, metrics, predictions
 from dapdata import rng as rngs
-from dapdata.config import EvalConfig, TrainConfig
+from dapdata.config import IMPORTED, EvalConfig, TrainConfig
 from dapdata.console import seldom
 from dapdata.errors import FormatError, UsageError
 from dapdata.loading import Dataset
@@ -78,7 +78,7 @@ def evaluate(
         data: Dataset; default: the one that the run was trained on.
         split: Which demos.
         trials: How many of them; default: the recipe's. The first ones of the split, in order.
-        protocol: "strict" or "rpdiff"; default: the recipe's.
+        protocol: "strict", "rpdiff" or "shown"; default: the recipe's.
         method: dap, cap, oracle, random or heuristic.
         k: Candidates for each demo that are ranked and judged; default: the recipe's.
         draws: Candidates for each demo that the modes are counted on, at least k: the k, then others, which are refined
@@ -108,7 +108,7 @@ def evaluate(
     draws = draws or max(k, config.draws or k)
     if len(dataset) == 0:
         raise UsageError(f"{dataset.root}: split '{split}': got 0 demos, expected at least 1; choose another split")
-    if predictor is not None and predictor.task != dataset.task:
+    if predictor is not None and not {predictor.task, dataset.task} & IMPORTED.keys() and predictor.task != dataset.task:
         raise UsageError(f"{run}: was trained on task {predictor.task}, the data are of task {dataset.task}; give its own data")
     folder = Path(out) if out is not None else _folder(run, method, dataset, changes or {})
     folder.mkdir(parents=True, exist_ok=True)
@@ -119,7 +119,8 @@ def evaluate(
     def guess(name: str) -> Proposals:
         return _guess(baselines.load(name, usual), name, samples, draws, seed, say)
 
-    others = {name: guess(name) for name in baselines.NAMES} if references else {}
+    has_shapes = all(len(sample["scene/kind"]) for sample in samples)  # the heuristic places on true surfaces
+    others = {name: guess(name) for name in baselines.NAMES if has_shapes or name != "heuristic"} if references else {}
     mine = _predict(predictor, samples, k, draws, seed, say) if predictor else guess(method)
     log = _log(run if predictor else None)
     path = predictions.write(folder / "predictions.npz", predictions.collect(mine.placements, k))

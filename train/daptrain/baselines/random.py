@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dapdata.poses import pose, rotation_about, transform
+from dapdata.poses import inverse, pose, rotation_about, transform
 from dapdata.records import ROLES, Placement
 from dapdata.solids import bounds
 
@@ -31,8 +31,15 @@ def place(sample: dict[str, Array], k: int, rng: np.random.Generator) -> list[Pl
 def interior(sample: dict[str, Array]) -> tuple[Array, Array]:
     """(3,) low and high corner of the box in which an upright object's centre may be, container frame, m.
 
-    That is the box around the container's own parts; of one that opens upwards, half the object's height higher.
+    That is the box around the container's own parts, or around its cloud where nobody knows them; of one that opens upwards,
+    half the object's height higher.
     """
+    if not len(sample["scene/kind"]):
+        cloud = transform(inverse(sample["pose/T_world_container"]), sample["container/points"].astype(float))
+        low, high = cloud.min(axis=0), cloud.max(axis=0)
+        if sample["scene/opening"][2] > 0.5:
+            high[2] += np.ptp(sample["object/points"][:, 2]) / 2
+        return low, high
     own = sample["scene/role"] == ROLES.index("container")
     boxes = bounds(sample["scene/kind"][own], sample["scene/size"][own], sample["scene/T_container_part"][own])
     low, high = boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)

@@ -8,7 +8,7 @@ much of them the other one explains, and what else would fit as well.
 Considered and not taken: Open3D's FPFH features with RANSAC or fast global registration, four seeds each, followed by the
 same refinement. On ten demonstrations each of fruits, cans, plates and mugs, scanned in simulation, 9, 10, 10 and 3
 came out within 10 mm and 15 degrees here, 8, 10, 10 and 2 with RANSAC, 7, 6, 10 and 2 with fast global registration.
-Theirs took longer, and theirs change with the number of threads.
+Nothing is drawn here, and Open3D is not needed.
 """
 
 from __future__ import annotations

@@ -471,7 +471,7 @@ def test_init_needs_a_folder_for_scans_and_none_for_a_task(capsys: pytest.Captur
 
 @pytest.mark.slow
 def test_fruits_of_simulated_scans_are_placed_within_millimetres(tmp_path: Path) -> None:
-    tree = imports.EXAMPLE | {"demos": 20, "seed": 1}
+    tree = imports.EXAMPLE | {"demos": 10, "seed": 1}
     dataset = pipeline.generate(imports.recipe.from_resolved(tree), tmp_path / "fruit", engine="inline")
     pipeline.label(dataset, engine="inline")
     source = scans.export(str(dataset), tmp_path / "scans")
@@ -480,7 +480,7 @@ def test_fruits_of_simulated_scans_are_placed_within_millimetres(tmp_path: Path)
     again = imports.run(asked, tmp_path / "b", workers=2, engine="local")
     (told,) = imports.agreement(asked, str(first))
     count, median, p90 = map(float, re.findall(r"(\d+) demos: (.*?) mm median, (.*?) p90;", told)[0])
-    assert count >= 14
+    assert count >= 7
     assert median < 3
     assert p90 < 6
     digests = {health.inspect(str(made)).to_dict()["content_sha256"] for made in (first, again)}

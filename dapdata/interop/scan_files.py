@@ -56,9 +56,10 @@ CLOUDS = (*STAGES, *(f"{stage}_{body}" for stage in STAGES for body in BODIES)) 
 ABOUT = "scan.json"
 SPANS = {"container": (0.05, 5.0), "object": (0.005, 1.0)}  # m
 ROUGH = 1e-3  # of a rotation in text with few digits
+FEW = 100  # points that are neither: fewer tell no table
 SAMPLE = 65_536  # bytes at the beginning, middle and end of a file by which another one is known
 LEVEL = 0.01  # m: thickness of a table in a scan
-FOOT_SHARE, FOOT_WIDER = (0.25, 0.97), 2.0  # shares of points and times the area that make a foot a table
+FOOT_SHARE, FOOT_WIDER = (0.25, 0.97), 4.0  # shares of points and times the area that make a foot a table
 LEVEL_SHARE = 2.0  # times as many of the rest's points lie in one layer across another axis: that one is up
 
 
@@ -195,7 +196,7 @@ def read(config: ScansConfig, demo: int) -> Scan:
     _check_up(about, T_world_camera, turned["start", "container"].points)
     if config.check_table:
         for (stage, body), cloud in turned.items():
-            _check_no_table(f"{stage}, {body}", cloud.points)
+            _check_no_table(f"{stage}, {body}", cloud.points, about.table is not None or len(rest.points) >= FEW)
     axis, opening = (np.array((0, 0, 1.0)) if v is None else R_world_scan @ _unit(v) for v in (about.axis, about.opening))
     return Scan(folder, about, turned, _moved(rest, down), axis, opening, K, T_world_camera)
 
@@ -365,7 +366,7 @@ def _table(about: About, rest: Array, container: Array) -> float:
     Args:
         rest: (R, 3), container: (N, 3), m, with z up as told.
     """
-    if len(rest) < 100:
+    if len(rest) < FEW:
         return float(np.quantile(container[:, 2], 0.01))
     found = [_layer(rest[:, k]) for k in range(3)]
     best = int(np.argmax([share for _, share in found]))
@@ -390,10 +391,15 @@ def _check_up(about: About, T_world_camera: Array, container: Array) -> None:
             )
 
 
-def _check_no_table(where: str, points: Array) -> None:
-    """Whether the foot of a body is not much wider than all above it: then it is what it stands on."""
+def _check_no_table(where: str, points: Array, is_known: bool) -> None:
+    """Whether the foot of a body is not much wider than all above it, and as high as the table if that is known: a table.
+
+    A stand's foot may be as wide, but what is seen of it is its upper face.
+    """
     foot = points[:, 2] < np.quantile(points[:, 2], 0.01) + LEVEL
     if not FOOT_SHARE[0] <= foot.mean() <= FOOT_SHARE[1]:
+        return
+    if is_known and abs(float(np.median(points[foot, 2]))) > LEVEL / 2:
         return
     below, above = (np.quantile(part[:, :2], (0.02, 0.98), axis=0) for part in (points[foot], points[~foot]))
     wider = float(np.prod(np.ptp(below, axis=0)) / np.prod(np.ptp(above, axis=0)))

@@ -6,7 +6,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -36,7 +36,7 @@ PLY_TYPES = {
 }  # fmt: skip
 
 
-Columns = Mapping[str, Array]  # (N,) numbers by field
+Columns = dict[str, Array]  # (N,) numbers by field
 
 
 @dataclass(frozen=True)
@@ -62,9 +62,11 @@ def read_cloud(path: str | Path) -> tuple[Array, Array]:
         raise FormatError(
             f"{path}: has no {' '.join(missing)}, expected {' '.join(FIELDS)}; estimate normals that point to the sensor first"
         )
-    rows = np.stack([columns[name] for name in FIELDS], axis=1).astype(np.float64)
-    if not (np.abs(rows) < LARGEST_NUMBER).all():
-        raise FormatError(f"{path}: has NaN, infinite or huge numbers, expected finite metres; remove those points")
+    rows = np.empty((len(columns["x"]), len(FIELDS)))
+    for i, name in enumerate(FIELDS):
+        rows[:, i] = columns.pop(name)
+        if not (np.abs(rows[:, i]) < LARGEST_NUMBER).all():
+            raise FormatError(f"{path}: has NaN, infinite or huge numbers, expected finite metres; remove those points")
     lengths = np.linalg.norm(rows[:, 3:], axis=1, keepdims=True)
     if len(rows) == 0 or (lengths == 0).any():
         raise FormatError(f"{path}: has {'normals of length 0' if len(rows) else 'no points'}, expected points with normals")
@@ -199,8 +201,7 @@ def _read_pcd(path: Path, file: BinaryIO) -> Columns:
 
 def _ascii_columns(path: Path, file: BinaryIO, names: Sequence[str], count: int) -> Columns:
     """The known columns of lines of numbers."""
-    known = [name for name in KNOWN if name in names]
-    columns, rows = [names.index(name) for name in known], [np.zeros((0, len(known)))]
+    columns = {name: np.zeros(count) for name in KNOWN if name in names}
     for start in range(0, count, BLOCK):
         words = b"".join(islice(file, min(BLOCK, count - start))).split()
         expected = min(BLOCK, count - start) * len(names)
@@ -214,8 +215,9 @@ def _ascii_columns(path: Path, file: BinaryIO, names: Sequence[str], count: int)
             table = np.array(words[:expected]).astype(np.float64).reshape(-1, len(names))
         except ValueError as error:
             raise FormatError(f"{path}: holds words among its numbers ({error}), expected points") from error
-        rows.append(table[:, columns])
-    return dict(zip(known, np.concatenate(rows).T))
+        for name, column in columns.items():
+            column[start : start + len(table)] = table[:, names.index(name)]
+    return columns
 
 
 def _binary_columns(path: Path, file: BinaryIO, fields: Sequence[Any], count: int) -> Columns:
@@ -227,12 +229,12 @@ def _binary_columns(path: Path, file: BinaryIO, fields: Sequence[Any], count: in
     left = path.stat().st_size - file.tell()
     if left < count * dtype.itemsize:
         raise FormatError(f"{path}: holds {left} bytes, expected {count * dtype.itemsize}; the file is cut off")
-    known = [name for name in KNOWN if name in names]
-    rows = np.zeros((count, len(known)))
+    columns = {name: np.zeros(count) for name in KNOWN if name in names}
     for start in range(0, count, BLOCK):
         table = np.frombuffer(file.read(min(BLOCK, count - start) * dtype.itemsize), dtype)
-        rows[start : start + len(table)] = np.stack([table[name] for name in known], axis=1) if known else 0
-    return dict(zip(known, rows.T))
+        for name, column in columns.items():
+            column[start : start + len(table)] = table[name]
+    return columns
 
 
 def _number(path: Path, text: str) -> int:

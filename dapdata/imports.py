@@ -131,6 +131,7 @@ def run(asked: Recipe, out: Place | None, **options: Any) -> Place | Plan:
 
 EXAMPLE = {  # small images, so that the example is a few MB
     "name": "example_scans",
+    "seed": 5,
     "demos": 3,
     "scene": {"task": "fruit_rack"},
     "cameras": {

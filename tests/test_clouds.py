@@ -123,12 +123,6 @@ def test_labels_that_are_not_whole_are_refused(tmp_path: Path) -> None:
         read_points(tmp_path / "a.npz")
 
 
-def test_a_text_cloud_that_would_fill_the_memory_is_refused_by_its_header(tmp_path: Path) -> None:
-    (tmp_path / "a.ply").write_bytes(ply("ascii", text(ROWS), 4_000_000))
-    with pytest.raises(FormatError, match="4000000 points as text, expected 1666666 at the most; save it as binary"):
-        read_points(tmp_path / "a.ply")
-
-
 @pytest.mark.parametrize("far", [0.0, 1e7])
 def test_thinning_takes_the_mean_of_each_cube_however_far_points_are_apart(far: float) -> None:
     points = np.array([[0.1, 0.1, 0.1], [far, far, far + 0.95], [0.3, 0.1, 0.5]])

@@ -195,5 +195,9 @@ def _aligned(views: Mapping[Where, list[View]], scan: Scan) -> Array:
         _views(("start", "table"), scan.rest, scan) if scan.rest.view is not None else [(np.zeros((0, 3)),) * 2] * len(cameras)
     )
     of_camera = [[*(found[v] for found in views.values()), table[v]] for v in range(len(cameras))]
-    points, normals = ([np.concatenate([view[k] for view in own]) for own in of_camera] for k in range(2))
+    T_camera_world = inverse(scan.T_world_camera)
+    points, normals = (
+        [move(T, np.concatenate([view[k] for view in own])).astype(np.float32) for T, own in zip(T_camera_world, of_camera)]
+        for k, move in enumerate((transform, rotate))
+    )
     return align(cameras, points, normals)

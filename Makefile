@@ -35,6 +35,11 @@ env:
 	if (( moved )) || ! $(PYTHON) $(IS_311) 2>/dev/null; then "$$found" -m venv --clear .venv; fi
 	echo 'installing into .venv: two minutes or so, the first time' >&2
 	$(PYTHON) -m pip install -qq -c constraints.txt -e '.[all,dev]'
+	echo 'compiling the kernels' >&2
+	made=$$(mktemp -d)
+	$(PYTHON) -m dapdata generate recipes/can_cabinet.yaml --demos 1 --out "$$made/dataset" > /dev/null
+	$(PYTHON) -m dapdata label "$$made/dataset" > /dev/null
+	rm -r "$$made"
 	echo "$$wanted" > .venv/.installed
 
 demo: env

@@ -25,7 +25,7 @@ RECIPES = Path(__file__).parents[1] / "recipes"
 TASKS = "can_cabinet", "book_shelf"
 SIZES = (320, 240), (640, 480)
 RPDIFF_MS = {"can_cabinet": 3200.0, "book_shelf": 6700.0}
-LIMIT_MS = {320: 100.0, 640: 220.0}
+LIMIT_MS = {320: 35.0, 640: 90.0}
 UNIT = "CPU ms/demo"
 Case = tuple[str, tuple[int, int]]
 

@@ -102,10 +102,11 @@ def assign(
     for k in range(max(rounds, 1)):
         seed_points, seed_normals, _ = group_means(points, normals, label, num, step)
         step = 1 if k >= rounds - 1 else max(1, len(points) // (ROUND_POINTS * num))
+        seeds = np.hstack((seed_points, seed_normals))
         head, following = _seed_grid(seed_points, edge, int(span / edge) + 1)
         for i in range(0, len(points), step):
             if rounds > 0 or label[i] < 0:
-                label[i] = _nearest(points, normals, i, label[i], seed_points, seed_normals, head, following, edge, weights)
+                label[i] = _nearest(points[i], normals[i], label[i], seeds, head, following, edge, weights)
     return label
 
 
@@ -148,25 +149,24 @@ def _seed_grid(seed_points: Array, edge: float, cells: int) -> tuple[Array, Arra
     return head, following
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _nearest(
-    points: Array,
-    normals: Array,
-    i: int,
+    point: Array,
+    normal: Array,
     guess: int,
-    seed_points: Array,
-    seed_normals: Array,
+    seeds: Array,
     head: Array,
     following: Array,
     edge: float,
     weights: tuple[float, float, float],
 ) -> int:
-    """The nearest seed of point i: the guess (unless -1) or one in the 27 cells around; among all if there is none."""
-    x, y, z = points[i, 0], points[i, 1], points[i, 2]
+    """The nearest seed of a point: the guess (unless -1) or one in the 27 cells around; among all if there is none."""
+    x, y, z = point[0], point[1], point[2]
+    own = (x, y, z, normal[0], normal[1], normal[2])
     cells = head.shape[0]
     cx, cy, cz = int(x / edge), int(y / edge), int(z / edge)
     nearest = guess
-    best = _distance(points, normals, i, seed_points, seed_normals, guess, weights) if guess >= 0 else np.inf
+    best = _distance(own, seeds[guess], weights) if guess >= 0 else np.inf
     if not best < np.inf:
         best, nearest = np.inf, -1
     for dx in (0, -1, 1):
@@ -182,13 +182,13 @@ def _nearest(
                     continue
                 s = head[cx + dx, cy + dy, cz + dz]
                 while s >= 0:
-                    d = _distance(points, normals, i, seed_points, seed_normals, s, weights)
+                    d = _distance(own, seeds[s], weights)
                     if d < best or (d == best and s < nearest):
                         best, nearest = d, s
                     s = following[s]
     if nearest < 0:
-        for s in range(len(seed_points)):
-            d = _distance(points, normals, i, seed_points, seed_normals, s, weights)
+        for s in range(len(seeds)):
+            d = _distance(own, seeds[s], weights)
             if d < best:
                 best, nearest = d, s
     return nearest
@@ -203,18 +203,10 @@ def _outside(p: float, c: int, step: int, edge: float) -> float:
 
 
 @njit(cache=True)
-def _distance(
-    points: Array,
-    normals: Array,
-    i: int,
-    seed_points: Array,
-    seed_normals: Array,
-    s: int,
-    weights: tuple[float, float, float],
-) -> float:
-    """Squared distance of point i and seed s, in cells; NaN for an empty seed."""
-    d0, d1, d2 = points[i, 0] - seed_points[s, 0], points[i, 1] - seed_points[s, 1], points[i, 2] - seed_points[s, 2]
-    m0, m1, m2 = seed_normals[s, 0], seed_normals[s, 1], seed_normals[s, 2]
+def _distance(own: tuple[float, float, float, float, float, float], seed: Array, weights: tuple[float, float, float]) -> float:
+    """Squared distance, in cells, of a point and a seed (6,), each with its normal; NaN for an empty seed."""
+    d0, d1, d2 = own[0] - seed[0], own[1] - seed[1], own[2] - seed[2]
+    m0, m1, m2 = seed[3], seed[4], seed[5]
     off = m0 * d0 + m1 * d1 + m2 * d2
-    turned = 1.0 - (normals[i, 0] * m0 + normals[i, 1] * m1 + normals[i, 2] * m2)
+    turned = 1.0 - (own[3] * m0 + own[4] * m1 + own[5] * m2)
     return float((d0 * d0 + d1 * d1 + d2 * d2) * weights[0] + turned * weights[1] + off * off * weights[2])

@@ -1,13 +1,15 @@
-"""One depth and segmentation image of a shelf of 100 parts: our ray caster against PyBullet's TinyRenderer and Open3D.
+"""One depth and segmentation image of a shelf of 100 parts: our ray caster against TinyRenderer, Open3D and Embree.
 
 Rivals get their scene built beforehand and return less: TinyRenderer no incidence and a raw depth buffer, Open3D
-a distance along the ray. Ours packs the scene and returns metres, part ids and incidence in each call. Pixels where
+and Embree a distance along the ray. Ours packs the scene and returns metres, part ids and incidence in each call. Pixels where
 depths differ by more than 5 mm are counted (at silhouettes), so that all are seen to draw the same picture.
 """
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
+from importlib.util import find_spec
 
 import numpy as np
 from timing import Row, chosen, compare, main
@@ -21,7 +23,7 @@ SIZES = (320, 240), (640, 480)
 FOV_DEG = 60.0
 NEAR, FAR = 0.1, 5.0
 # TinyRenderer samples a pixel at (u, v + 1), not at its centre (u + 0.5, v + 0.5): the principal point that makes up for it.
-SAMPLE_SHIFT = {"tinyrenderer": np.array([[0, 0, 0.5], [0, 0, -0.5], [0, 0, 0]]), "open3d": np.zeros((3, 3))}
+SAMPLE_SHIFT = {"tinyrenderer": np.array([[0, 0, 0.5], [0, 0, -0.5], [0, 0, 0]])}
 
 
 def shelf(parts: int = 100) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -94,6 +96,42 @@ def open3d_caster(kind: np.ndarray, size: np.ndarray, T: np.ndarray, T_world_cam
     return render, depth
 
 
+def embree_caster(kind: np.ndarray, size: np.ndarray, T: np.ndarray, T_world_camera: np.ndarray, width: int, height: int):
+    """A function that casts all rays of a view at tessellated parts with Embree, and one that gives depth in metres."""
+    import trimesh
+    from embreex.mesh_construction import TriangleMesh
+    from embreex.rtcore_scene import EmbreeScene
+
+    scene = EmbreeScene()
+    for k, s, t in zip(kind, size, T):
+        mesh = trimesh.creation.cylinder(s[0] / 2, s[2], 32) if k else trimesh.creation.box(s)
+        TriangleMesh(scene, mesh.apply_transform(t).triangles.astype(np.float32))
+    K, (v, u) = intrinsics(width, height, FOV_DEG), np.mgrid[:height, :width] + 0.5
+    rays = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones_like(u)], axis=-1).reshape(-1, 3)
+    way = (rays @ T_world_camera[:3, :3].T).astype(np.float32)
+    start = np.tile(T_world_camera[:3, 3], (len(rays), 1)).astype(np.float32)
+
+    def render():
+        return scene.run(start, way, output=1)
+
+    def depth() -> np.ndarray:
+        hit = render()
+        return np.where(hit["geomID"] >= 0, hit["tfar"], 0).reshape(height, width)
+
+    return render, depth
+
+
+def is_there(name: str, against: str | None) -> bool:
+    """Whether a rival can be run. Embree is left out where it is not installed (`pip install embreex`), unless asked for."""
+    if name == "embree" and against is None and find_spec("embreex") is None:
+        print("embree: embreex is not installed, left out", file=sys.stderr)
+        return False
+    return True
+
+
+RIVALS = {"tinyrenderer": tiny_renderer, "open3d": open3d_caster, "embree": embree_caster}
+
+
 def run(scale: str, against: str | None) -> Iterator[Row]:
     kind, size, T = shelf()
     T_world_camera = look_at(np.array([0, 0, 0.38]), 20.0, 15.0, 1.2)
@@ -105,10 +143,11 @@ def run(scale: str, against: str | None) -> Iterator[Row]:
             return cast(kind, size, inverse(T_world_camera) @ T, K, width, height, NEAR, FAR)
 
         contenders, notes = {"dapdata": ours}, {}
-        for name, make in {"tinyrenderer": tiny_renderer, "open3d": open3d_caster}.items():
-            if against in (None, name):
+        for name, make in RIVALS.items():
+            if against in (None, name) and is_there(name, against):
                 contenders[name], their_depth = make(kind, size, T, T_world_camera, width, height)
-                depth = cast(kind, size, T_camera_part, K + SAMPLE_SHIFT[name], width, height, NEAR, FAR).depth
+                shift = SAMPLE_SHIFT.get(name, np.zeros((3, 3)))
+                depth = cast(kind, size, T_camera_part, K + shift, width, height, NEAR, FAR).depth
                 notes[name] = f"{(np.abs(their_depth() - depth) > 0.005).mean():.2%} of pixels differ by over 5 mm"
         case = f"{width}x{height}, {len(kind)} parts"
         yield from compare("render", case, chosen(contenders, against), 5 if scale == "quick" else 25, notes=notes)

@@ -20,14 +20,16 @@ from dapdata.errors import EnvironmentProblem, UsageError, nearest
 
 RIVALS = {  # script: whom it compares with
     "startup": ("python",),
-    "render": ("tinyrenderer", "open3d"),
+    "render": ("tinyrenderer", "open3d", "embree"),
+    "superpoints": ("voxel",),
     "generate": ("rpdiff",),
     "load": ("block-shuffled", "npz-per-demo", "zarr-slices"),
     "memory": ("10 demos",),
     "train": ("bfloat16", "torch-compile"),
     "infer": ("fast", "100-steps"),
+    "size": ("zstd-5", "zstd-19", "blosc-zstd", "blosc-lz4", "gzip", "uncompressed", "rpdiff-files"),
 }
-PACKAGES = ("numpy", "numba", "pybullet", "open3d", "zarr", "torch")
+PACKAGES = ("numpy", "numba", "pybullet", "open3d", "embreex", "zarr", "torch")
 Row = dict[str, Any]
 
 

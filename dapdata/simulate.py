@@ -559,7 +559,8 @@ class _World:
         self._body_of_part = np.zeros(len(parts[0]), np.int64)
         low, high = self._object_bounds(np.eye(4))
         for shared in _shared_bodies(parts[0], self._bounds, float(np.linalg.norm(high - low))):
-            self._body_of_part[shared] = self._fixed(*(x[shared] for x in parts), part_meshes[shared[0]])
+            kind, size, T = (array[shared] for array in parts)
+            self._body_of_part[shared] = self._fixed(kind, size, T, part_meshes[shared[0]])
         self._probe = self._copy(0.0, np.eye(4))
         self._bullet.setCollisionFilterGroupMask(self._probe, -1, 0, 0, physicsClientId=self._client)
 

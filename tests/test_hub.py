@@ -88,12 +88,13 @@ def lines_of_the_table() -> dict[str, str]:
         ("webdataset", "webdataset as wds"),
         ("pointcept", "numpy as np"),
         ("scenes", "trimesh"),
+        ("rpdiff", "numpy as np"),
         pytest.param("parquet", "datasets", marks=pytest.mark.slow),
     ],
 )
 def test_the_line_of_the_table_reads_the_export(format: str, module: str, sample: dict[str, Any]) -> None:
     pytest.importorskip(module.split()[0], reason=NEEDS_INTEROP)
-    assert set(lines_of_the_table()) == {"webdataset", "parquet", "pointcept", "scenes"}
+    assert set(lines_of_the_table()) == {"webdataset", "parquet", "pointcept", "scenes", "rpdiff"}
     found = executed(f"import {module}\nfound = {lines_of_the_table()[format]}")["found"]
     count, others = (len(sample[f"{body}/points"]) for body in ("container", "object"))
     if format == "webdataset":
@@ -102,6 +103,8 @@ def test_the_line_of_the_table_reads_the_export(format: str, module: str, sample
         assert len(found["container/points"]) == count
     elif format == "pointcept":
         assert len(found) == count + others
+    elif format == "rpdiff":
+        assert len(found["multi_obj_start_pcd"].item()["child"]) == others
     else:
         assert len([name for name in found.graph.nodes_geometry if name.startswith("goal_")]) == len(sample["goals/kind"])
 

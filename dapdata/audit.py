@@ -31,7 +31,6 @@ from dapdata.manifest import Manifest, UnitEntry
 from dapdata.records import LATER, Array, Mesh, meshes_in
 from dapdata.schemas import shard_schema
 from dapdata.stages import Unit
-from dapdata.tables import Index
 from dapdata.units import index_row
 
 OWN_FILES = (manifest.MANIFEST, manifest.PROGRESS, manifest.LOG, durable.LOCK)  # of the machinery, not of the data
@@ -418,38 +417,47 @@ class _IndexRows:
             yield f"index.parquet: split: got {min({*words} - {*PARTS})!r:.80}, expected one of {', '.join(PARTS)}"
             return
         parts = np.array([PARTS.index(word) for word in words], np.uint8)[codes]
-        yield from _splits(index, self.found, parts)
+        yield from _splits(self.found, np.bincount(parts, minlength=len(PARTS)))
         for name in INSTANCES:
-            yield from _shared(name, index.read(name), parts)
+            instances = _by_split(index.read(name), parts)
+            yield from _instances(self.found, name, instances)
+            yield from _shared(name, instances)
         for body, (digests, demos) in seen.geometry.items():
             if len(parts) == seen.demos:
-                yield from _shared(f"{body} geometry", np.array(digests), parts[np.array(demos, int)])
+                yield from _shared(f"{body} geometry", _by_split(np.array(digests), parts[np.array(demos, int)]))
 
 
-def _splits(index: Index, found: Manifest, parts: Array) -> Iterator[str]:
-    """Splits that the manifest tells otherwise; `parts` (D,) are places in PARTS."""
-    for place, part in enumerate(PARTS):
-        mine, told = parts == place, found.splits.get(part)
-        if told is None and not mine.any():
-            continue
-        for name in INSTANCES:
-            instances = split.distinct(index.read(name)[mine])
-            claimed = getattr(told, f"{name}s", None)
-            if told is None or told.demos != mine.sum() or claimed not in (len(instances), instances.tolist()):
-                yield f"manifest.json: splits.{part}: demos or {name}s are not those of the index"
+def _by_split(things: Array, parts: Array) -> dict[str, Array]:
+    """The things (N,) that are in each split, without repetition; `parts` (N,) are places in PARTS."""
+    return {part: split.distinct(things[parts == place]) for place, part in enumerate(PARTS)}
+
+
+def _splits(found: Manifest, counts: Array) -> Iterator[str]:
+    """Splits of which the manifest tells other numbers of demos than the index, (len(PARTS),)."""
+    for part, count in zip(PARTS, counts.tolist()):
+        told = found.splits[part].demos if part in found.splits else 0
+        if told != count:
+            yield f"manifest.json: splits.{part}: {told} demos, expected {count} as in the index"
     yield from (f"manifest.json: splits.{part}: no such split" for part in found.splits.keys() - {*PARTS})
 
 
-def _shared(what: str, things: Array, parts: Array) -> Iterator[str]:
-    """Which of some things (N,) are in more than one split (N,), as places in PARTS; what is unused may share with any."""
-    used = parts != PARTS.index(split.UNUSED)
-    names, number = np.unique(things[used], return_inverse=True)
-    pairs = np.unique(number * len(PARTS) + parts[used])
-    things_of, parts_of = np.divmod(pairs, len(PARTS))
-    leaks = np.flatnonzero(np.bincount(things_of, minlength=len(names)) > 1)
+def _instances(found: Manifest, name: str, instances: Mapping[str, Array]) -> Iterator[str]:
+    """Splits of which the manifest tells other instances than the index, or in a large dataset another number of them."""
+    for part in PARTS:
+        told = getattr(found.splits[part], f"{name}s") if part in found.splits else []
+        mine = instances[part]
+        if told != (len(mine) if isinstance(told, int) else mine.tolist()):
+            yield f"manifest.json: splits.{part}: {name}s are not those of the index"
+
+
+def _shared(what: str, things: Mapping[str, Array]) -> Iterator[str]:
+    """What is in more than one split, of what is in each; unused demos may share with any."""
+    owned = {part: mine for part, mine in things.items() if part != split.UNUSED}
+    together = np.sort(np.concatenate([*owned.values()]))
+    leaks = split.distinct(together[1:][together[1:] == together[:-1]])
     for leak in leaks[:MANY]:
-        owners = " and ".join(sorted(PARTS[part] for part in parts_of[things_of == leak]))
-        yield f"index.parquet: {what} {names[leak]} is in {owners}: {len(leaks)} leak"
+        owners = " and ".join(sorted(part for part, mine in owned.items() if leak in mine))
+        yield f"index.parquet: {what} {leak} is in {owners}: {len(leaks)} leak"
 
 
 def _lineage(found: Manifest, slim: bool) -> Iterator[str]:

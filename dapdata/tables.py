@@ -19,6 +19,7 @@ from dapdata.errors import CorruptionError, FormatError
 from dapdata.records import Array
 
 GROUP_ROWS = 1 << 17  # rows in a Parquet row group: what a writer holds in memory
+STREAMED_ROWS = 1 << 13  # rows that are Python objects at a time
 ROW_BYTES = 32  # that a row of either table takes at least: a digest
 MAX_COLUMNS, MAX_WORD, MAX_INFLATION = 100, 1000, 100  # more columns, longer words, larger columns are a bomb's
 
@@ -154,7 +155,7 @@ class Index(Mapping[str, Array]):
         import pyarrow.parquet as pq
 
         with _explained(self.path), pq.ParquetFile(self.path) as file:
-            for batch in file.iter_batches(batch_size=GROUP_ROWS, columns=list(names)):
+            for batch in file.iter_batches(batch_size=STREAMED_ROWS, columns=list(names)):
                 yield from zip(*(batch.column(name).to_pylist() for name in names))
 
     def _column(self, name: str) -> Any:

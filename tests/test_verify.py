@@ -319,6 +319,18 @@ def test_nonsense_in_a_shard_is_found_though_every_hash_is_right(name: str, gold
     assert cli.run_app(["verify", str(golden_copy)]) == 3
 
 
+def test_a_stranger_can_check_the_manifest_as_the_page_says(golden: Path) -> None:
+    page = (Path(__file__).parents[1] / "docs/reliability.md").read_text()
+    (code,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    path, data = golden.parent / "manifest.json", (golden / manifest.MANIFEST).read_bytes()
+    code = code.replace("data/quickstart/manifest.json", str(path))
+    path.write_bytes(data)
+    exec(code, {})
+    path.write_bytes(data + b" ")
+    with pytest.raises(AssertionError):
+        exec(code, {})
+
+
 def test_what_no_check_of_sense_could_take_is_found_before_these(golden_copy: Path) -> None:
     shard = manifest.read(golden_copy).shards[0].path
     forge_arrays(golden_copy, shard, lambda sample: sample["object/superpoint"].fill(-1))

@@ -24,6 +24,8 @@ RIVALS = {  # script: whom it compares with
     "generate": ("rpdiff",),
     "load": ("block-shuffled", "npz-per-demo", "zarr-slices"),
     "memory": ("10 demos",),
+    "train": ("bfloat16", "torch-compile"),
+    "infer": ("fast", "100-steps"),
 }
 PACKAGES = ("numpy", "numba", "pybullet", "open3d", "zarr", "torch")
 Row = dict[str, Any]

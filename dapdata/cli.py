@@ -13,6 +13,7 @@ import os
 import shutil
 import signal
 import sys
+from collections import Counter
 from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
@@ -26,6 +27,7 @@ from dapdata.console import (
     last,
     made_text,
     placements_text,
+    printable,
     progress,
     remember,
     report_text,
@@ -36,6 +38,7 @@ from dapdata.console import (
 from dapdata.errors import DapdataError, UsageError, require
 
 CLICK_ERROR: type[Exception] = typer.BadParameter.__mro__[2]  # ClickException, of all bad arguments; not exported
+TOLD = 10  # rejected demos of an import that are told one by one
 STOPPED, INTERRUPTED = "stopped; the same command, run again, goes on where it stopped", 130
 
 Net = Literal["both", "affordance", "pose"]
@@ -146,7 +149,7 @@ def run_app(arguments: Sequence[str]) -> int:
 
 
 def _fail(message: str, code: int) -> int:
-    print(message, file=sys.stderr)
+    print(printable(message), file=sys.stderr)
     return code
 
 
@@ -331,18 +334,29 @@ def inspect(dataset: LastDataset = None, as_json: Json = False) -> None:
     show(found.to_dict(), as_json, str(found))
 
 
-@app.command(epilog="Example: dapdata verify data/can_cabinet")
+@app.command(epilog="Example: dapdata verify data/can_cabinet --deep --reproduce 2")
 def verify(
     dataset: LastDataset = None,
     quick: Annotated[bool, typer.Option("--quick", help="Only compare files with their hashes.")] = False,
+    deep: Annotated[bool, typer.Option("--deep", help="Decode cached units too, compare everything with everything.")] = False,
+    reproduce: Annotated[
+        int | None, _option("--reproduce", help="Also make so many units anew from the recipe, and compare", min=1, metavar="K")
+    ] = None,
+    workers: Workers = None,
     as_json: Json = False,
 ) -> int:
-    """Say whether it is whole. Each file by its hash, each array by its content, splits that share nothing."""
+    """Say whether it is whole. Each file by its hash, each demo by its content and its sense, splits that share nothing."""
     from dapdata import health
+    from dapdata.reproduce import reproduce as make_anew
 
+    if quick and deep:
+        raise UsageError("--quick, --deep: one looks at files alone, the other at everything; give one of them")
     folder = last("dataset", dataset)
     with progress("verify", "unit") as advance:
-        found = health.verify(folder, quick=quick, progress=advance)
+        found = health.verify(folder, quick=quick, deep=deep, progress=advance)
+    if reproduce is not None and found.ok:
+        with progress("reproduce", "unit") as advance:
+            found = found.with_reproduced(*make_anew(folder, reproduce, workers=_count(workers), progress=advance))
     show(found.to_dict(), as_json, str(found))
     return 0 if found.ok else 3
 
@@ -436,6 +450,9 @@ def evaluate(
         list[str] | None,
         _option("--set", help="Override of a train key that acts at inference (--curve: of any)", metavar="KEY=VALUE"),
     ] = None,
+    fast: Annotated[
+        bool, typer.Option("--fast", help="Few steps of sampling (train.sample_steps=3): quicker, a little less accurate.")
+    ] = False,
     curve: Annotated[
         str | None,
         _option("--curve", help="Train anew on so many demos each, such as 10,20,40, and judge them all", metavar="N,N,..."),
@@ -457,11 +474,14 @@ def evaluate(
     as_json: Json = False,
 ) -> None:
     """Predict on a split, then judge in physics. Writes predictions.npz, report.json, report.html, pictures of failures."""
+    from dapdata.config import FAST
     from daptrain import evaluate as evaluate_run
     from daptrain.checkpoint import read_description
 
     judging: dict[str, Any] = {"split": split, "trials": trials, "protocol": protocol, "k": k, "draws": draws, "device": device}
     if curve is not None:
+        if fast:
+            raise UsageError("--fast: is of one report; with --curve give --set train.sample_steps=3")
         asked = judging | {"minutes": minutes, "steps": steps, "workers": _count(workers)}
         _evaluate_curve(curve, run, data, out, overrides, method, as_json, asked)
         return
@@ -474,7 +494,7 @@ def evaluate(
         out = out or run.parent / f"{method}-{run.name}"
     elif data is None:
         data = last("dataset", None)
-    changes = _train_keys(overrides)
+    changes = (FAST if fast else {}) | _train_keys(overrides)
     report = evaluate_run(run, data, method=method, changes=changes, workers=_count(workers), out=out, **judging)
     if run is not None:
         remember(run=run)
@@ -665,19 +685,13 @@ def import_scans(
     as_json: Json = False,
 ) -> None:
     """Your own scans, before and after. Where the object went is told by registration, or the demo is rejected."""
-    from dapdata.errors import RejectedError
-    from dapdata.imports import agreement, rejected_scans, scans_recipe
+    from dapdata.imports import agreement, scans_recipe
 
     asked = scans_recipe(source, demos, overrides or ())
     means = {"workers": workers, "engine": engine, "memory": memory, "allow_missing": allow_missing, "fresh": fresh}
-    try:
-        _import(asked, out, dry_run, as_json, **means)
-    except RejectedError:
-        for line in rejected_scans(asked, out):
-            say(line)
-        raise
+    _import(asked, out, dry_run, as_json, **means)
     if not dry_run:
-        for line in (*rejected_scans(asked, out), *agreement(asked, out)):
+        for line in agreement(asked, out):
             say(line)
 
 
@@ -688,11 +702,18 @@ def _import(asked: Any, out: str | None, dry_run: bool, as_json: bool, **means: 
 
     with progress("import", "demo") as advance:
         made = run(asked, out, dry_run=dry_run, progress=None if dry_run else advance, **means)
-    if isinstance(made, str | Path):
-        rejected = health.inspect(made).to_dict()["rejects"]["demos"]
-        told = "".join(f", {count} {reason}" for reason, count in rejected.items())
-        say(f"imported {asked.demos - sum(rejected.values())} of {asked.demos} demos{told}; next: dapdata label {made}")
-    _show_made(made, as_json, None)
+    if not isinstance(made, str | Path):
+        show(made.to_dict(), as_json, str(made))
+        return
+    rejected = health.rejected(made)
+    for told in rejected[:TOLD]:
+        say(f"rejected demo {told['demo']}, {told['reason']}: {told['detail']}")
+    if len(rejected) > TOLD:
+        say(f"rejected {len(rejected) - TOLD} more; --json tells all")
+    counts = "".join(f", {count} {reason}" for reason, count in Counter(told["reason"] for told in rejected).items())
+    say(f"imported {asked.demos - len(rejected)} of {asked.demos} demos{counts}; next: dapdata label {made}")
+    remember(dataset=made)
+    show({"dataset": str(made), "demos": asked.demos, "rejected": rejected}, as_json, str(made))
 
 
 @exports.command("webdataset", epilog="Example: dapdata export webdataset data/can_cabinet --out tars --shard-size 200")

@@ -6,17 +6,17 @@
 
 from __future__ import annotations
 
-import tokenize
-import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dapdata.errors import FormatError
+from dapdata.npz import BROKEN, read_array, read_arrays
 
 Array = NDArray[Any]
 
@@ -26,8 +26,10 @@ KNOWN = (*FIELDS, LABEL, VIEW)
 ARRAYS = {"points": FIELDS[:3], "normals": FIELDS[3:], LABEL: (LABEL,), VIEW: (VIEW,)}  # of npz files, and their columns
 PCD_NAMES = {"normal_x": "nx", "normal_y": "ny", "normal_z": "nz"}
 MAX_HEADER = 65_536  # bytes
-MAX_POINTS, MAX_WORDS = 5_000_000, 10_000_000  # a cloud's points; numbers in a text file, which take ten times their memory
-BROKEN = (ValueError, EOFError, MemoryError, SyntaxError, tokenize.TokenError)  # what numpy raises at damaged headers
+MAX_POINTS = 5_000_000  # of which two copies take half a gigabyte
+MAX_WORD = 64  # letters of a number
+LARGEST_NUMBER = 1e9  # m: squares of larger ones could overflow
+BLOCK = 100_000  # points that are read at a time
 PLY_TYPES = {
     "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4", "double": "f8",
     "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4", "float32": "f4", "float64": "f8",
@@ -61,8 +63,8 @@ def read_cloud(path: str | Path) -> tuple[Array, Array]:
             f"{path}: has no {' '.join(missing)}, expected {' '.join(FIELDS)}; estimate normals that point to the sensor first"
         )
     rows = np.stack([columns[name] for name in FIELDS], axis=1).astype(np.float64)
-    if not np.isfinite(rows).all():
-        raise FormatError(f"{path}: has NaN or infinite numbers, expected finite metres; remove those points")
+    if not (np.abs(rows) < LARGEST_NUMBER).all():
+        raise FormatError(f"{path}: has NaN, infinite or huge numbers, expected finite metres; remove those points")
     lengths = np.linalg.norm(rows[:, 3:], axis=1, keepdims=True)
     if len(rows) == 0 or (lengths == 0).any():
         raise FormatError(f"{path}: has {'normals of length 0' if len(rows) else 'no points'}, expected points with normals")
@@ -119,7 +121,10 @@ def _read(path: Path) -> Columns:
     if path.suffix.lower() not in readers:
         raise FormatError(f"{path}: got '{path.suffix}', expected a point cloud: {', '.join(readers)}")
     try:
-        return readers[path.suffix.lower()](path)
+        if path.exists() and not path.is_file():  # a pipe would be waited for, a device has no end
+            raise FormatError(f"{path}: no plain file, expected a point cloud")
+        with path.open("rb") as file:
+            return readers[path.suffix.lower()](path, file)
     except OSError as error:
         raise FormatError(f"{path}: cannot be read ({error.strerror or error}), expected a point cloud") from error
 
@@ -142,20 +147,19 @@ def write_ply(path: str | Path, points: Array, normals: Array | None = None, **m
     return Path(path)
 
 
-def _header(path: Path, end: bytes) -> tuple[list[list[str]], int]:
-    """The words of each line of a header, up to the line that starts with `end`; and where what comes after it begins."""
-    with path.open("rb") as file:
-        data = file.read(2 * MAX_HEADER)
-    at = data.find(b"\n" + end, 0, MAX_HEADER)
-    stop = data.find(b"\n", at + 1, at + MAX_HEADER)
+def _header(path: Path, file: BinaryIO, end: bytes) -> list[list[str]]:
+    """The words of each line of a header, up to the line that starts with `end`; the file is left at what comes after."""
+    start = file.read(MAX_HEADER)
+    at = start.find(b"\n" + end)
+    stop = start.find(b"\n", at + 1)
     if at < 0 or stop < 0:
         raise FormatError(f"{path}: has no header that ends with '{end.decode()}', expected a {path.suffix} file")
-    text = data[:stop].decode("ascii", errors="replace")
-    return [line.split() for line in text.splitlines() if line.split()], stop + 1
+    file.seek(stop + 1)
+    return [line.split() for line in start[:stop].decode("ascii", errors="replace").splitlines() if line.split()]
 
 
-def _read_ply(path: Path) -> Columns:
-    lines, start = _header(path, b"end_header")
+def _read_ply(path: Path, file: BinaryIO) -> Columns:
+    lines = _header(path, file, b"end_header")
     formats = [line[1] for line in lines if line[0] == "format" and len(line) > 1]
     elements = [i for i, line in enumerate(lines) if line[0] == "element"]
     if lines[0] != ["ply"] or not formats or not elements or lines[elements[0]][1:2] != ["vertex"]:
@@ -166,98 +170,93 @@ def _read_ply(path: Path) -> Columns:
     if len(columns) != sum(line[0] == "property" for line in properties):
         raise FormatError(f"{path}: has vertex properties of unknown type, expected {', '.join(PLY_TYPES)}")
     if formats[0] == "ascii":
-        return _ascii_columns(path, start, [name for name, _ in columns], count)
+        return _ascii_columns(path, file, [name for name, _ in columns], count)
     order = {"binary_little_endian": "<", "binary_big_endian": ">"}.get(formats[0])
     if order is None:
-        raise FormatError(f"{path}: format '{formats[0]}', expected ascii, binary_little_endian or binary_big_endian")
-    return _binary_columns(path, start, [(name, order + PLY_TYPES[kind]) for name, kind in columns], count)
+        raise FormatError(f"{path}: format {formats[0]!r}, expected ascii, binary_little_endian or binary_big_endian")
+    return _binary_columns(path, file, [(name, order + PLY_TYPES[kind]) for name, kind in columns], count)
 
 
-def _read_pcd(path: Path) -> Columns:
-    lines, start = _header(path, b"DATA")
-    about = {line[0]: line[1:] for line in lines}
+def _read_pcd(path: Path, file: BinaryIO) -> Columns:
+    about = {line[0]: line[1:] for line in _header(path, file, b"DATA")}
     missing = {"FIELDS", "SIZE", "TYPE", "POINTS", "DATA"} - about.keys()
     if missing or not all(about[name] for name in ("FIELDS", "POINTS", "DATA")):
         raise FormatError(f"{path}: header without {', '.join(sorted(missing)) or 'values'}, expected a pcd file")
     names, count = [PCD_NAMES.get(name, name) for name in about["FIELDS"]], _number(path, about["POINTS"][0])
     if about["DATA"][0] == "ascii":
-        return _ascii_columns(path, start, names, count)
+        return _ascii_columns(path, file, names, count)
     if about["DATA"][0] != "binary":
-        raise FormatError(f"{path}: DATA {about['DATA'][0]}, expected ascii or binary; save it uncompressed")
+        raise FormatError(f"{path}: DATA {about['DATA'][0]!r}, expected ascii or binary; save it uncompressed")
     kinds = [f"{kind.lower()}{size}" for kind, size in zip(about["TYPE"], about["SIZE"])]
     counts = [_number(path, text) for text in about.get("COUNT", ["1"] * len(names))]
     if len(kinds) != len(names) or len(counts) != len(names) or not {*kinds} <= {*PLY_TYPES.values(), "i8", "u8"}:
         raise FormatError(f"{path}: FIELDS, SIZE, TYPE and COUNT do not agree, expected one of each for a field")
+    if any(n != 1 for name, n in zip(names, counts) if name in KNOWN) or sum(counts) > MAX_HEADER:
+        raise FormatError(f"{path}: COUNT {' '.join(about['COUNT'])[:40]!r}, expected 1 for each of {' '.join(FIELDS)}")
     fields = [(name, f"<{kind}", (n,)) if n > 1 else (name, f"<{kind}") for name, kind, n in zip(names, kinds, counts)]
-    return _binary_columns(path, start, fields, count)
+    return _binary_columns(path, file, fields, count)
 
 
-def _ascii_columns(path: Path, start: int, names: Sequence[str], count: int) -> Columns:
-    """The known columns of lines of numbers."""
-    if count * len(names) > MAX_WORDS:
-        raise FormatError(f"{path}: {count} points as text, expected {MAX_WORDS // len(names)} at the most; save it as binary")
-    with path.open("rb") as file:
-        file.seek(start)
-        words = b"".join(line for _, line in zip(range(count), file)).split()
-    if len(words) < count * len(names):
-        raise FormatError(f"{path}: holds {len(words)} numbers, expected {count} points of {len(names)}; the file is cut off")
-    try:
-        table = np.array(words[: count * len(names)], dtype="S32").astype(np.float64).reshape(count, len(names))
-    except ValueError as error:
-        raise FormatError(f"{path}: holds words among its numbers ({error}), expected points") from error
-    return {name: table[:, names.index(name)] for name in KNOWN if name in names}
+def _ascii_columns(path: Path, file: BinaryIO, names: Sequence[str], count: int) -> Columns:
+    """The known columns, f8, of lines of numbers."""
+    known = [name for name in KNOWN if name in names]
+    rows = [np.zeros((0, len(known)))]
+    for start in range(0, count, BLOCK):
+        words = b"".join(islice(file, min(BLOCK, count - start))).split()
+        expected = min(BLOCK, count - start) * len(names)
+        if len(words) < expected:
+            raise FormatError(
+                f"{path}: holds {len(words)} numbers, expected {expected} from point {start} on; the file is cut off"
+            )
+        if max(map(len, words)) > MAX_WORD:
+            raise FormatError(f"{path}: holds a word of more than {MAX_WORD} letters, expected numbers")
+        try:
+            table = np.array(words[:expected]).astype(np.float64).reshape(-1, len(names))
+        except ValueError as error:
+            raise FormatError(f"{path}: holds words among its numbers ({error}), expected points") from error
+        rows.append(table[:, [names.index(name) for name in known]])
+    return dict(zip(known, np.concatenate(rows).T))
 
 
-def _binary_columns(path: Path, start: int, fields: Sequence[Any], count: int) -> Columns:
-    """The known columns of packed records."""
+def _binary_columns(path: Path, file: BinaryIO, fields: Sequence[Any], count: int) -> Columns:
+    """The known columns, f8, of packed records."""
     names = [field[0] for field in fields]
+    known = [name for name in KNOWN if name in names]
     if len({*names}) != len(names):
         raise FormatError(f"{path}: names a field twice, expected {' '.join(FIELDS)} once")
-    dtype, there = np.dtype(list(fields)), path.stat().st_size - start
-    if there < count * dtype.itemsize:
-        raise FormatError(f"{path}: holds {there} bytes, expected {count * dtype.itemsize}; the file is cut off")
-    table = np.fromfile(path, dtype=dtype, count=count, offset=start)
-    known = [name for name in KNOWN if name in names and table[name].ndim == 1]
-    return {name: table[name] for name in known}
+    dtype = np.dtype(list(fields))
+    left = path.stat().st_size - file.tell()
+    if left < count * dtype.itemsize:
+        raise FormatError(f"{path}: holds {left} bytes, expected {count * dtype.itemsize}; the file is cut off")
+    rows = np.zeros((count, len(known)))
+    for start in range(0, count, BLOCK):
+        table = np.frombuffer(file.read(min(BLOCK, count - start) * dtype.itemsize), dtype)
+        rows[start : start + len(table)] = np.stack([table[name] for name in known], axis=1)
+    return dict(zip(known, rows.T))
 
 
 def _number(path: Path, text: str) -> int:
     if not text.isascii() or not text.isdigit() or not int(text[:12]) <= MAX_POINTS:
-        raise FormatError(
-            f"{path}: count '{text[:20]}', expected a whole number of at most {MAX_POINTS}; thin the cloud, to a point a mm say"
-        )
+        raise FormatError(f"{path}: count {text[:20]!r}, expected a whole number of at most {MAX_POINTS}; thin the cloud out")
     return int(text)
 
 
-def _read_npz(path: Path) -> Columns:
-    try:
-        with zipfile.ZipFile(path) as archive:
-            sizes = {info.filename.removesuffix(".npy"): info.file_size for info in archive.infolist()}
-        wanted = [name for name in ARRAYS if name in sizes]
-        if "points" not in wanted:
-            raise FormatError(f"{path}: has {', '.join(sizes) or 'nothing'}, expected `points` and `normals`, both (N, 3)")
-        if any(sizes[name] > 8 * len(ARRAYS[name]) * MAX_POINTS + MAX_HEADER for name in wanted):
-            raise FormatError(f"{path}: unpacks to more than {MAX_POINTS} points, expected fewer; thin the cloud")
-        with np.load(path, allow_pickle=False) as arrays:
-            found = {name: arrays[name] for name in wanted}
-    except (zipfile.BadZipFile, NotImplementedError, KeyError, *BROKEN) as error:
-        if isinstance(error, FormatError):
-            raise
-        raise FormatError(f"{path}: is no npz file of plain arrays ({error}), expected `points` and `normals`") from error
+def _read_npz(path: Path, file: BinaryIO) -> Columns:
+    found = read_arrays(path, ("points",), [name for name in ARRAYS if name != "points"])
     columns: dict[str, Array] = {}
     for name, array in found.items():
         shape = (len(found["points"]) if found["points"].ndim else 0, *([3] if len(ARRAYS[name]) == 3 else []))
-        if array.shape != shape or array.dtype.kind not in "fiub":
+        if array.shape != shape or array.dtype.kind not in "fiu":
             raise FormatError(f"{path}: {name}: {array.dtype} {array.shape}, expected numbers {shape}, a row for each point")
         columns |= zip(ARRAYS[name], array.reshape(len(array), -1).T)
     return columns
 
 
-def _read_npy(path: Path) -> Columns:
+def _read_npy(path: Path, file: BinaryIO) -> Columns:
     try:
-        rows = np.load(path, allow_pickle=False, mmap_mode="r")
+        rows = read_array(file, path.stat().st_size)
     except BROKEN as error:
-        raise FormatError(f"{path}: is no npy file of plain numbers ({error}), expected (N, 6)") from error
+        raise FormatError(f"{path}: is no npy file of plain numbers ({str(error)[:120]!r}), expected (N, 6)") from error
     if rows.ndim != 2 or rows.shape[1] not in (3, 6) or rows.dtype.kind not in "fiu" or len(rows) > MAX_POINTS:
         raise FormatError(f"{path}: shape {rows.shape}, expected (N, 6): x y z and the normal of each point")
     return dict(zip(FIELDS, rows.T))

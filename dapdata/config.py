@@ -76,7 +76,13 @@ class RpdiffConfig(SceneConfig):
     meshes: str | None = key(None, "folder of the meshes and slots; null: none, so that nothing can be settled or judged")
     meshes_sha256: str | None = key(None, "of the names and contents of its files")
     table_height: float = key(1.0, "z of the table top in the source; it becomes z = 0", unit="m", ge=-10, le=10)
-    opening: Literal["+x", "-x", "+y", "-y", "+z"] = key("+x", "axis of the container's frame that points out of its opening")
+    opening: Literal["auto", "+x", "-x", "+y", "-y", "+z"] = key(
+        "auto",
+        "axis of the container's frame out of its opening; auto: +x, or +z if the demonstrated goal is reached from there",
+    )
+    hanging: Literal["auto", "yes", "no"] = key(
+        "auto", "whether objects hang, on pegs along which they come; auto: by the name of the container, such as rack or hook"
+    )
     symmetry: Literal["auto", "none", "box", "revolution"] = key(
         "auto", "of the objects; auto: by the shape of the mesh, or without one by the name: books are boxes, cans are round"
     )
@@ -143,6 +149,7 @@ PAPER: dict[str, Any] = {
 # Keys that inference reads: `dapdata eval --set train.KEY=VALUE` changes them without training again. Only `crop_margin`
 # acts in training as well, with anything from none of it to twice as much.
 AT_INFERENCE = ("sample_steps", "crop_margin", "cap_crop", "refine", "hover", "ranking")
+FAST = {"sample_steps": 3}  # of `dapdata eval --fast`: a fifth of the time, for some success (docs/accuracy.md)
 
 # STEPS and CRITERIA of daptrain.refine, which must not be imported here; a test compares them.
 Step = Literal["gravity", "yaw", "settle", "search", "spread"]

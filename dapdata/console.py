@@ -37,7 +37,12 @@ def seldom(speak: Callable[[str], None]) -> Callable[[str], None]:
 
 def show(result: Mapping[str, Any], as_json: bool, text: str) -> None:
     """The result of a command, on stdout."""
-    print(json.dumps(result, indent=1, default=str) if as_json else text, flush=True)
+    print(json.dumps(result, indent=1, default=str) if as_json else printable(text), flush=True)
+
+
+def printable(text: str) -> str:
+    """The text without what would steer a terminal: names of files and words in them may hold anything."""
+    return "".join(letter if letter.isprintable() or letter in "\n\t" else "?" for letter in text)
 
 
 @contextmanager

@@ -7,6 +7,9 @@ missing chunk as fill values without a word; hence a whole unit is committed at 
 
 A dataset in an object store is worked on in a copy on this machine (remote.py). What is made durable in the copy is
 repeated in the store by the copy's `Mirror`, so there is one order of steps for both.
+
+A dataset may come from anywhere. Links in it could lead a reader or a writer out of its folder, so there are none:
+`is_inside` and `refuse_links` see to that, and `read_json` believes no size before it has looked.
 """
 
 from __future__ import annotations
@@ -17,19 +20,22 @@ import json
 import os
 import shutil
 import socket
+import stat
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from hashlib import file_digest, sha256
 from pathlib import Path
 from typing import IO, Any, Protocol
 
-from dapdata.errors import EnvironmentProblem, LockedError
+from dapdata.errors import EnvironmentProblem, FormatError, LockedError
 
 STAGING = "staging"
 TEMPORARY = ".*.tmp"  # names that are half-written until they are renamed
+LOCK = ".lock"
+MAX_JSON = 256_000_000  # bytes: the manifest of ten million demos
 FULL_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 NO_PERMISSION = (errno.EACCES, errno.EPERM, errno.EROFS)
 
@@ -76,7 +82,9 @@ def digest(value: Any) -> str:
 
 
 def hash_file(path: Path) -> str:
-    """sha256 of a file's bytes."""
+    """sha256 of a file's bytes; an OSError if it is no plain file: a pipe would be waited for."""
+    if not stat.S_ISREG(path.lstat().st_mode):
+        raise OSError(errno.EINVAL, "no plain file", str(path))
     with path.open("rb") as file:
         return file_digest(file, "sha256").hexdigest()
 
@@ -147,9 +155,13 @@ def move(folder: Path, target: Path) -> bool:
 def replace_file(path: Path, data: bytes) -> None:
     """Writes a file so that its name holds either the old bytes or the new ones, also after a power cut."""
     make_folder(path.parent)
-    temporary = path.with_name(f".{path.name}.{socket.gethostname()}.{os.getpid()}.tmp")
-    temporary.write_bytes(data)
-    move_file(temporary, path)
+    temporary = path.with_name(f".{path.name}.{_here()}.tmp")
+    try:
+        temporary.write_bytes(data)
+        move_file(temporary, path)
+    except OSError:  # a full disk: what was written of it must not fill it further
+        temporary.unlink(missing_ok=True)
+        raise
 
 
 def move_file(source: Path, target: Path) -> None:
@@ -160,6 +172,18 @@ def move_file(source: Path, target: Path) -> None:
     _fsync(target.parent)
     if mirror := mirror_of(target):
         mirror.replace(target)
+
+
+def _here() -> str:
+    """What tells the names that this process makes from those of others that share the folder."""
+    return f"{socket.gethostname()}.{os.getpid()}"
+
+
+def is_occupied(folder: Path) -> bool:
+    """Whether something is there, other than what a killed command of ours may have left in an empty folder."""
+    if not folder.is_dir():
+        return folder.exists()
+    return any(path.name not in (LOCK, STAGING) and not path.match(TEMPORARY) for path in folder.iterdir())
 
 
 def remove_file(path: Path) -> None:
@@ -189,8 +213,10 @@ def sweep(root: Path) -> None:
     Staging is renamed first: a worker that has not heard yet of its command's end (on another machine it may go on for
     some seconds) then fails, instead of committing a folder that is half swept.
     """
-    with suppress(FileNotFoundError):
-        (root / STAGING).rename(root / f".{STAGING}.{socket.gethostname()}.{os.getpid()}.tmp")
+    grave = root / f".{STAGING}.{_here()}.tmp"
+    shutil.rmtree(grave, ignore_errors=True)  # of a process that was killed at this, and had the same number
+    if (root / STAGING).is_dir():
+        _rename(root / STAGING, grave)
     for leftover in [*root.glob(TEMPORARY), *root.glob(f"*/{TEMPORARY}")]:
         if leftover.is_dir():
             shutil.rmtree(leftover, ignore_errors=True)
@@ -205,23 +231,27 @@ def this_process() -> str:
 
 @contextmanager
 def lock(root: Path, *, shared: bool = False, patience: float = 0.0) -> Iterator[None]:
-    """Holds the dataset for one writer, or for several that share it; readers need no lock. It dies with its process.
+    """Holds a dataset or run for one writer, or for several that share it; readers need no lock. It dies with its process.
 
     Those who share it may commit units, which is a rename each and harmless if two make the same one. They neither
     sweep nor publish.
 
     Args:
-        root: The dataset's folder.
+        root: The dataset's or run's folder.
         shared: Whether others may hold it at the same time, if they share it too.
         patience: How long to wait for it, s.
 
     Raises:
         LockedError: if another process holds it; the message says which.
+        FormatError: if the folder has links, through which a writer would change what is elsewhere.
     """
     make_folder(root)
-    with (root / ".lock").open("a+") as file:
+    refuse_links([root / LOCK])
+    handle = os.open(root / LOCK, os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_NOFOLLOW, 0o644)
+    with os.fdopen(handle, "a+", errors="replace") as file:
         deadline = time.monotonic() + patience
         _flock(root, file, fcntl.LOCK_SH if shared else fcntl.LOCK_EX, deadline)
+        refuse_links([*root.glob("*"), *root.glob("*/*")])  # down to the units
         mine = f"{this_process()}\n"
         if not shared:
             file.truncate(0)
@@ -261,12 +291,64 @@ def _flock(root: Path, file: IO[str], kind: int, deadline: float) -> None:
 def holder(root: Path) -> str | None:
     """Who works on the dataset now, as it said itself; None if nobody does. Those on other machines are believed."""
     try:
-        lines = (root / ".lock").read_text().splitlines()
-    except OSError:
+        lines = read_plain(root / LOCK).decode(errors="replace").splitlines()
+    except (OSError, ValueError):
         return None
     here = f" on {socket.gethostname()} ("
     working = [line for line in lines if here not in line or Path("/proc", line.split()[1]).exists()]
     return f"{working[0]} and {len(working) - 1} more" if len(working) > 1 else next(iter(working), None)
+
+
+# What others may have put there ------------------------------------------------------------------------------
+
+
+def is_inside(root: Path, path: Path) -> bool:
+    """Whether a path leads, through all links, to something in the folder `root`."""
+    return path.resolve().is_relative_to(root.resolve())
+
+
+def refuse_links(paths: Iterable[Path]) -> None:
+    """Raises a FormatError if one of these is something else than a file or a folder; those that aren't there are fine."""
+    for path in paths:
+        with suppress(FileNotFoundError):
+            mode = path.lstat().st_mode
+            if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+                raise FormatError(
+                    f"{path}: a {'link' if stat.S_ISLNK(mode) else 'pipe or device'}, expected files and folders of a dataset "
+                    "or run alone; put what it leads to there"
+                )
+
+
+def read_plain(path: Path, limit: int = MAX_JSON) -> bytes:
+    """A file's bytes.
+
+    Raises:
+        ValueError: larger than `limit`, or no file of bytes at all: a pipe would be waited for, a link leads elsewhere.
+        OSError: if it cannot be read.
+    """
+    about = path.lstat()
+    if not stat.S_ISREG(about.st_mode):
+        raise ValueError("no plain file")
+    if about.st_size > limit:
+        raise ValueError(f"{about.st_size} bytes, expected at most {limit}")
+    return path.read_bytes()
+
+
+def read_json(path: Path, limit: int = MAX_JSON) -> Any:
+    """What a JSON file holds; raises as `read_plain`, and a ValueError if it is not JSON or nested without end."""
+    return parse_json(read_plain(path, limit))
+
+
+def parse_json(text: bytes | str) -> Any:
+    """What JSON says; a ValueError if it is none, says NaN or is nested without end."""
+    try:
+        return json.loads(text, parse_constant=_refuse_constant)
+    except RecursionError as error:
+        raise ValueError("nested too deeply") from error
+
+
+def _refuse_constant(name: str) -> Any:
+    raise ValueError(f"{name}, expected numbers that are finite")
 
 
 @contextmanager
@@ -289,7 +371,7 @@ def disk_problems(root: Path, needed: int = 0) -> Iterator[None]:
             ) from error
         if error.errno in NO_PERMISSION:
             raise EnvironmentProblem(
-                f"{error.filename or root}: {error.strerror}, expected a folder that can be written; choose another with --out"
+                f"{error.filename or root}: {error.strerror}, expected a folder that can be written; choose another"
             ) from error
         raise
 

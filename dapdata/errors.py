@@ -4,7 +4,6 @@ DapdataError
 ├── UsageError (ValueError)           2   a command or call that makes no sense
 │   ├── RecipeError                   2   a recipe value that is unknown, mistyped or out of range
 │   ├── FormatError                   2   no dataset, a dataset of another version, a foreign file
-│   ├── RejectedError                 2   demos, every one of which was rejected
 │   └── CheckpointError               2   weights of another task or another network
 ├── CorruptionError (OSError)         3   bytes that are not what the manifest says; a judge that fails its oracle
 ├── QuarantineError (RuntimeError)    4   units that failed more often than they may
@@ -41,10 +40,6 @@ class RecipeError(UsageError):
 
 class FormatError(UsageError):
     """A folder or file that is not what it should be, or of another format version."""
-
-
-class RejectedError(UsageError):
-    """Every demo was rejected; the message counts the reasons."""
 
 
 class CheckpointError(UsageError):

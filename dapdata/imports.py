@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dapdata import manifest, pipeline, recipe, remote, store
+from dapdata import health, manifest, pipeline, recipe, remote, store
 from dapdata.config import ScansConfig
 from dapdata.errors import UsageError
 from dapdata.interop import rpdiff_clouds, rpdiff_files, rpdiff_scenes, scan_clouds, scan_files, scan_placement
@@ -119,10 +119,12 @@ def run(asked: Recipe, out: Place | None, **options: Any) -> Place | Plan:
     is_new = isinstance(place, Path) and not place.exists()
     try:
         return pipeline.generate(asked, place, **options)
-    except UsageError:
-        if is_new and isinstance(place, Path) and place.exists():
-            shutil.rmtree(place)
-        raise
+    except UsageError as error:
+        if not (is_new and isinstance(place, Path) and place.exists()):
+            raise
+        first = health.rejected(place)[:1] if (place / manifest.MANIFEST).exists() else []
+        shutil.rmtree(place)
+        raise UsageError("; ".join([str(error), *(f"demo {told['demo']}: {told['detail']}" for told in first)])) from error
 
 
 # Scans -----------------------------------------------------------------------------------------------------
@@ -145,7 +147,6 @@ EXAMPLE = {  # small images, so that the example is a few MB
     },
 }
 WRONG_MM, WRONG_DEG = 10.0, 20.0  # a placement that is farther from the truth is another one
-TOLD = 20  # rejected demonstrations that are told one by one; each is registered again for that
 
 
 def example_scans(out: Path) -> Path:
@@ -160,19 +161,6 @@ def example_scans(out: Path) -> Path:
         pipeline.generate(recipe.from_resolved(EXAMPLE, (), "example"), dataset, workers=1, engine="inline")
         pipeline.label(dataset, workers=1, engine="inline")
         return scan_export.export(dataset, out)
-
-
-def rejected_scans(asked: Recipe, out: Place | None) -> Iterator[str]:
-    """A line for each of the first demonstrations of an import of scans that were rejected: folder, reason, what was found."""
-    config = asked.scene
-    assert isinstance(config, ScansConfig)
-    accepted = {demo for demo, _ in _imported(asked, out)}
-    rejected = sorted({*range(asked.demos)} - accepted)
-    for demo in rejected[:TOLD]:
-        line = scan_placement.explain(config, demo) or "too few points are left, see cameras.min_object_points"
-        yield f"{scan_files.folder_of(config, demo)}: {line}"
-    if len(rejected) > TOLD:
-        yield f"and {len(rejected) - TOLD} more that were rejected"
 
 
 def agreement(asked: Recipe, out: Place | None) -> Iterator[str]:

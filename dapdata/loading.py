@@ -7,16 +7,19 @@ slice whatever its size, so a slice a demo is far slower than the unit at once. 
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from dapdata import manifest, remote, rng, store
+from dapdata import durable, manifest, remote, rng, store, tables
+from dapdata.buckets import is_inside
+from dapdata.config import Section
 from dapdata.errors import CorruptionError, FormatError, UsageError, hint, nearest, require
 from dapdata.manifest import Manifest
 from dapdata.records import Array
@@ -28,6 +31,7 @@ from dapdata.tables import Index
 if TYPE_CHECKING:
     from torch.utils import data
 
+S = TypeVar("S", bound=Section)
 BLOCKS_HELD = 4  # shards whose demos a shuffled stream mixes
 
 
@@ -41,22 +45,43 @@ def open(root: str | Path, split: str | None = None) -> Dataset:
     Raises:
         FormatError: if there is no dataset, one of another format, or one that isn't labelled yet.
         UsageError: if there is no such split.
-        CorruptionError: if the manifest and the index don't agree.
+        CorruptionError: if the manifest or the index is not what was written.
     """
     place = remote.locate(root)
     kept = remote.Kept(place)
     with kept.named():
-        found = manifest.read(kept.root)
-    if not found.shards:
+        found, index = _read(kept.root)
+    if index is None:
         raise FormatError(f"{place}: generated but not labelled, expected shards; run `dapdata label {place}`")
     known = list(found.splits)
     if split is not None and split not in known:
         raise UsageError(f"split: got '{split}', expected one of {', '.join(SPLITS)}{hint(split, list(SPLITS))}")
-    index = manifest.read_index(kept.root)
     if index.rows != sum(entry.demos for entry in found.splits.values()):
         raise CorruptionError(f"{place}: index.parquet and manifest.json name different demos; run `dapdata verify {place}`")
     mine = index if split is None else index.only(np.flatnonzero(index.read("split") == split))
     return Dataset(place, split, found, mine, kept)
+
+
+def _read(root: Path) -> tuple[Manifest, Index | None]:
+    """Manifest and index that belong together, also while a command puts others in their place: the manifest goes first.
+
+    Without shards there is no index.
+    """
+    while True:
+        before, found = _stamp(root), manifest.read(root)
+        try:
+            index = manifest.read_index(root) if found.shards else None
+        except CorruptionError:
+            if _stamp(root) == before:
+                raise
+            continue
+        if _stamp(root) == before:
+            return found, index
+
+
+def _stamp(root: Path) -> tuple[int, int, int] | None:
+    path = root / manifest.MANIFEST
+    return tables.stamp(path) if path.exists() else None
 
 
 @dataclass
@@ -74,6 +99,16 @@ class Dataset:
     def recipe(self) -> dict[str, Any]:
         """The resolved recipe."""
         return self.manifest.recipe
+
+    def section(self, name: str, kind: type[S]) -> S:
+        """A section of the recipe; a FormatError if there is none that this version knows."""
+        try:
+            return kind.model_validate_json(json.dumps(self.recipe.get(name, {})))
+        except ValueError as error:
+            raise FormatError(
+                f"{self.root}/{manifest.MANIFEST}: recipe.{name}: {' '.join(str(error).split())[:200]}; "
+                "read it with the dapdata that made it"
+            ) from error
 
     @property
     def task(self) -> str:
@@ -107,8 +142,11 @@ class Dataset:
         Raises:
             CorruptionError: if it isn't what was written.
         """
-        with remote.unit(self.root, shard, _known_paths(paths)) as folder:
-            if not store.is_committed(folder):
+        if not is_inside(shard):
+            raise CorruptionError(f"{self.root}: index.parquet names {shard!r:.80}, expected a shard; run `dapdata verify`")
+        paths = _known_paths(paths)
+        with remote.unit(self.root, shard, paths) as folder:
+            if not store.is_committed(folder) or not durable.is_inside(folder.parents[shard.count("/")], folder):
                 raise CorruptionError(
                     f"{folder}: missing, expected a shard that the manifest names; run `dapdata verify {self.root}`"
                 )

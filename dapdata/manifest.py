@@ -1,9 +1,9 @@
 """What a dataset is now: `manifest.json`, and `index.parquet` with one row a demo.
 
 The manifest names everything else with its sha256: each unit by the hash of its root, which in turn names the
-unit's files, and each single file by its own. It is replaced last. Where a file with a fixed name (index, card)
-changes, the old manifest goes first: a crash in between leaves no manifest rather than one that is wrong, and
-running the command again brings it back at once.
+unit's files, and each single file by its own; and itself by a digest of its other bytes. It is replaced last. Where a file
+with a fixed name (index, card) changes, the old manifest goes first: a crash in between leaves no manifest rather than
+one that is wrong, and running the command again brings it back at once, from what `progress.json` says of it.
 
 A manifest is of format 1 and has all in itself as long as it is small. With more than `LARGE` units and instances it is
 of format 2: shards are still listed with path, demos and sha256, but all else of units stands in `units.parquet`, which
@@ -14,14 +14,17 @@ of format 1 reads every dataset that it could hold anyway, and one of ten millio
 from __future__ import annotations
 
 import json
+import re
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from functools import cached_property
+from graphlib import TopologicalSorter
 from hashlib import sha256
 from pathlib import Path
 from typing import Annotated, Any, Literal, overload
 
-from pydantic import AfterValidator, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, Field, ValidationError
 
 from dapdata import durable, tables
 from dapdata.config import Section
@@ -38,17 +41,55 @@ CROISSANT = "croissant.json"
 PREVIEWS = "preview"
 PROGRESS = "progress.json"  # what a running or interrupted command works on
 LOG = "log.jsonl"  # when each unit was made, by whom, how long it took: never read by the data's users
+INDEX_NUMBERS = ("demo", "row", "seed", "container_instance", "object_instance")  # columns that reading relies on
+INDEX_WORDS = ("split", "shard", "task", "sha256")
+MAX_UNITS = 1_000_000  # of a stage: more are no dataset of ours
+OWN_DIGEST = re.compile(rb'"manifest_sha256": "([0-9a-f]{64})"')
 
 
 def _inside(path: str) -> str:
     """A path that stays in the dataset's folder."""
-    if "\\" in path or "\0" in path or any(part in ("", ".", "..") for part in path.split("/")):
+    if "\\" in path or not path.isprintable() or any(part in ("", ".", "..") for part in path.split("/")):
         raise ValueError("expected a relative path inside of the dataset")
     return path
 
 
+def _spec(spec: dict[str, Any]) -> dict[str, Any]:
+    """What a stage's results follow from, with all that unit keys are made from."""
+    kinds = {"version": int, "sections": dict, "needs": list, "packages": dict}
+    for name, kind in kinds.items():
+        if not isinstance(spec.get(name), kind):
+            raise ValueError(f"{name}: got {type(spec.get(name)).__name__}, expected {kind.__name__}")
+    if not all(isinstance(need, str) for need in spec["needs"]):
+        raise ValueError("needs: expected names of stages")
+    return spec
+
+
+def _acyclic(specs: dict[str, Any]) -> dict[str, Any]:
+    """Specs, or entries with specs, that need only each other, and not in a circle."""
+    needs = {name: getattr(entry, "spec", entry)["needs"] for name, entry in specs.items()}
+    unknown = [need for mine in needs.values() for need in mine if need not in needs]
+    if unknown:
+        raise ValueError(f"needs {unknown[0]!r}, expected one of {', '.join(needs)}")
+    TopologicalSorter(needs).prepare()
+    return specs
+
+
+def _recipe(recipe: dict[str, Any]) -> dict[str, Any]:
+    """A resolved recipe, as far as reading a dataset needs it."""
+    kinds = {"name": str, "seed": int, "demos": int, "shard_size": int, "scene": dict}
+    for name, kind in kinds.items():
+        if type(recipe.get(name)) is not kind:
+            raise ValueError(f"{name}: got {type(recipe.get(name)).__name__}, expected {kind.__name__}")
+    if recipe["seed"] < 0 or not recipe["shard_size"] > 0 or not 0 < recipe["demos"] <= MAX_UNITS * recipe["shard_size"]:
+        raise ValueError("seed, demos or shard_size: not those of a recipe")
+    return recipe
+
+
 RelativePath = Annotated[str, AfterValidator(_inside)]
 Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+Spec = Annotated[dict[str, Any], AfterValidator(_spec)]
+Resolved = Annotated[dict[str, Any], AfterValidator(_recipe)]
 
 
 class ShardEntry(Section):
@@ -70,7 +111,7 @@ class UnitEntry(ShardEntry):
 class StageEntry(Section):
     """How a stage was run, and the units that came of it."""
 
-    spec: dict[str, Any] = Field(description="version, recipe sections and packages that decide its results")
+    spec: Spec = Field(description="version, recipe sections and packages that decide its results")
     units: Sequence[UnitEntry] = Field(description="in demo order; empty if it is to be run again")
 
 
@@ -103,7 +144,7 @@ class _Facts(Section):
     task: str
     demos: int = Field(ge=0, description="demos asked for; those in the shards are this less rejects.demos and missing")
     content_sha256: Sha256 = Field(description="over the decoded arrays of every demo, in demo order")
-    recipe: dict[str, Any] = Field(description="resolved: every default filled in")
+    recipe: Resolved = Field(description="resolved: every default filled in")
     recipe_sha256: Sha256 = Field(description="of the resolved recipe as canonical JSON")
     splits: dict[str, SplitEntry] = Field(description="train, val, test; unused: would share an instance with two of them")
     rejects: Rejects
@@ -112,6 +153,27 @@ class _Facts(Section):
     )
     files: dict[RelativePath, Sha256] = Field(description="every other file that belongs to the dataset")
     created_by: dict[str, str] = Field(description="versions of the packages that wrote it")
+    manifest_sha256: Sha256 | None = Field(default=None, description="of this file, with 64 zeros in this place")
+
+
+class Progress(Section):
+    """What a running or interrupted command works on: enough to go on where there is no manifest."""
+
+    recipe: Resolved
+    specs: Annotated[dict[str, Spec], AfterValidator(_acyclic)] = Field(description="of all stages")
+    stages: list[str] = Field(description="that the command runs")
+    shard_stage: str
+    missing: list[MissingEntry] = Field(default=[], description="units that the stages before these could not make")
+
+
+class LogLine(BaseModel):
+    """What a worker tells of a unit that it made in one stage; whatever else it told is not read."""
+
+    stage: str
+    demos: int = Field(ge=0)
+    cpu_seconds: float = Field(ge=0, allow_inf_nan=False)
+    bytes: int = Field(ge=0)
+    peak_mb: int = Field(ge=0)
 
 
 class Manifest(_Facts):
@@ -119,13 +181,15 @@ class Manifest(_Facts):
 
     format: Literal[1] = Field(description="version of the format")
     shards: Sequence[UnitEntry] = Field(description="in demo order; empty until the dataset is labelled")
-    stages: dict[str, StageEntry] = Field(description="every stage that was run; the units of the last are the shards")
+    stages: Annotated[dict[str, StageEntry], AfterValidator(_acyclic)] = Field(
+        description="every stage that was run; the units of the last are the shards"
+    )
 
 
 class LargeStageEntry(Section):
     """How a stage was run, and how many units came of it."""
 
-    spec: dict[str, Any] = Field(description="version, recipe sections and packages that decide its results")
+    spec: Spec = Field(description="version, recipe sections and packages that decide its results")
     units: int = Field(ge=0, description="rows of units.parquet with this stage; 0 if it is to be run again")
 
 
@@ -135,7 +199,7 @@ class LargeManifest(_Facts):
     format: Literal[2] = Field(description="version of the format")
     shards: Sequence[ShardEntry] = Field(description="in demo order; empty until the dataset is labelled")
     shard_stage: str = Field(description="the stage whose units are the shards")
-    stages: dict[str, LargeStageEntry] = Field(description="every stage that was run")
+    stages: Annotated[dict[str, LargeStageEntry], AfterValidator(_acyclic)] = Field(description="every stage that was run")
 
 
 class Units(Sequence[UnitEntry]):
@@ -212,14 +276,36 @@ def read(root: Path) -> Manifest:
             raise FormatError(f"{root}: no {MANIFEST} yet, generation is running or was interrupted; run it again to go on")
         raise FormatError(f"{root}: no {MANIFEST}, expected a dataset's folder; datasets are made with `dapdata generate`")
     try:
-        tree = json.loads(path.read_bytes())
-        if _format(path, tree) == FORMAT:
-            return Manifest.model_validate_json(json.dumps(tree))
-        return _from_large(root, tree)
-    except (ValueError, RecursionError) as error:  # pydantic's and json's errors are ValueErrors
+        data = durable.read_plain(path)
+        _check_digest(data)
+        tree = durable.parse_json(data)
+        is_small = _format(path, tree) == FORMAT
+        found = Manifest.model_validate_json(json.dumps(tree)) if is_small else _from_large(root, tree)
+        if durable.digest(found.recipe) != found.recipe_sha256:
+            raise ValueError("recipe_sha256 is not that of the recipe")
+        return found
+    except (ValueError, OSError) as error:  # pydantic's and json's errors are ValueErrors
         if isinstance(error, FormatError):
             raise
-        raise CorruptionError(f"{path}: {_first_problem(error)}; expected the manifest of format {FORMAT}") from error
+        raise CorruptionError(
+            f"{path}: {_first_problem(error)}; expected the manifest of format {FORMAT}: run the `dapdata generate` that made "
+            "the dataset again, it writes the manifest anew"
+        ) from error
+
+
+def encode(tree: Mapping[str, Any], indent: int | None = 1) -> bytes:
+    """The bytes of a manifest, which carries its own digest."""
+    data = json.dumps({**tree, "manifest_sha256": "0" * 64}, indent=indent, sort_keys=True).encode() + b"\n"
+    return OWN_DIGEST.sub(b'"manifest_sha256": "%s"' % sha256(data).hexdigest().encode(), data)
+
+
+def _check_digest(data: bytes) -> None:
+    """Raises a ValueError if a manifest is not what was written; those of early datasets carry no digest."""
+    found = OWN_DIGEST.search(data)
+    if found:
+        unsigned = data[: found.start(1)] + b"0" * 64 + data[found.end(1) :]
+        if sha256(unsigned).hexdigest().encode() != found[1]:
+            raise ValueError("its bytes are not those that were written")
 
 
 def _format(path: Path, tree: Any) -> int:
@@ -229,7 +315,8 @@ def _format(path: Path, tree: Any) -> int:
     if type(found) is not int:
         raise FormatError(f"{path}: `format` is {found!r}, expected {known}; this is no manifest of dapdata")
     if found not in (FORMAT, LARGE_FORMAT):
-        maker = tree.get("created_by", {}).get("dapdata", "unknown") if isinstance(tree.get("created_by"), dict) else "unknown"
+        makers = tree.get("created_by")
+        maker = str(makers.get("dapdata", "unknown") if isinstance(makers, dict) else "unknown")[:40]
         remedy = "update dapdata" if found > FORMAT else "generate it again, or read it with that version"
         raise FormatError(f"{path}: format {found}, made by dapdata {maker}; this dapdata reads formats {known}: {remedy}")
     return found
@@ -265,6 +352,14 @@ def _first_problem(error: Exception) -> str:
     return str(error)
 
 
+def read_progress(root: Path) -> Progress | None:
+    """What a running or interrupted command works on; None if there is none, or if what it left cannot be read."""
+    try:
+        return Progress.model_validate_json(json.dumps(durable.read_json(root / PROGRESS)))
+    except (OSError, ValueError):
+        return None
+
+
 def publish(root: Path, manifest: Manifest, files: Mapping[str, bytes | Path]) -> None:
     """Makes the manifest the dataset's own, together with the single files whose hashes are added to it.
 
@@ -297,7 +392,7 @@ def publish(root: Path, manifest: Manifest, files: Mapping[str, bytes | Path]) -
 def _text(manifest: Manifest, table: bytes | Path | None) -> bytes:
     """A manifest as it is stored."""
     if not isinstance(table, Path):
-        return json.dumps(manifest.model_dump(mode="json"), indent=1, sort_keys=True).encode() + b"\n"
+        return encode(manifest.model_dump(mode="json"))
     tree = manifest.model_copy(update={"shards": [], "stages": {}}).model_dump(mode="json")
     shards = manifest.shards
     listed = Units(table, shards.stage, len(shards)) if isinstance(shards, Units) else []
@@ -307,7 +402,7 @@ def _text(manifest: Manifest, table: bytes | Path | None) -> bytes:
         "shard_stage": shards.stage if isinstance(shards, Units) else "",
         "stages": {name: {"spec": entry.spec, "units": len(entry.units)} for name, entry in manifest.stages.items()},
     }
-    return json.dumps(tree, sort_keys=True).encode() + b"\n"
+    return encode(tree, indent=None)
 
 
 def single_files(root: Path) -> list[str]:
@@ -320,19 +415,25 @@ def read_index(root: Path) -> tables.Index:
     """The columns of `index.parquet` as arrays of one length, each read when it is first asked for.
 
     Raises:
-        CorruptionError: if it is missing or no Parquet file.
+        CorruptionError: if it is missing or no Parquet file, or lacks columns.
     """
-    return tables.Index(root / INDEX)
+    index = tables.Index(root / INDEX)
+    there = list(index)  # asking the index whether it has a column would read that
+    for name in (*INDEX_NUMBERS, *INDEX_WORDS):
+        if name not in there or (name in index.numbers) != (name in INDEX_NUMBERS):
+            raise CorruptionError(
+                f"{index.path}: column {name} is missing or of another type, expected an index as it was written; "
+                f"run `dapdata verify {root}`"
+            )
+    return index
 
 
 def read_log(root: Path, last: int | None = None) -> Iterator[dict[str, Any]]:
     """The lines of the log that can be read, one for each unit that was made; only the last so many if asked for."""
     path = root / LOG
-    if not path.is_file():
+    if path.is_symlink() or not path.is_file() or path.stat().st_size > durable.MAX_JSON:
         return
     with path.open(encoding="utf-8", errors="replace") as file:
         for text in file if last is None else deque(file, last):
-            try:
-                yield dict(json.loads(text))
-            except (ValueError, TypeError):  # half-written, when its writer was killed
-                continue
+            with suppress(ValueError):  # half-written, when its writer was killed
+                yield LogLine.model_validate_json(text).model_dump()

@@ -35,6 +35,10 @@ NEARLY_CONVEX = 0.1  # share by which the hull of an object's piece may be large
 SHARP = np.radians(30)  # between faces: a sharper edge is seen as one
 
 
+class TooLargeError(FormatError):
+    """A mesh of more bytes or faces than are kept in a demo."""
+
+
 # Reading ---------------------------------------------------------------------------------------------------
 
 
@@ -42,7 +46,8 @@ def read_mesh(path: Path) -> Mesh:
     """The triangles of an obj, ply, stl or off file.
 
     Raises:
-        FormatError: no such file, another format, a header that does not fit, too many faces, numbers that are not finite,
+        TooLargeError: too many bytes or faces.
+        FormatError: no such file, another format, a header that does not fit, numbers that are not finite,
             faces of vertices that are not there, no area, or a size that cannot be metres.
         MissingExtraError: trimesh is not installed.
     """
@@ -53,7 +58,7 @@ def read_mesh(path: Path) -> Mesh:
     try:
         size = path.stat().st_size
         if size > MAX_BYTES:
-            raise FormatError(f"{path}: {size} bytes, expected {MAX_BYTES} at the most; decimate the mesh")
+            raise TooLargeError(f"{path}: {size} bytes, expected {MAX_BYTES} at the most; decimate the mesh")
         data = path.read_bytes()
     except OSError as error:
         raise FormatError(f"{path}: cannot be read ({error.strerror or error}), expected a mesh") from error
@@ -66,10 +71,13 @@ def read_mesh(path: Path) -> Mesh:
         raise
     except Exception as error:  # trimesh's readers raise whatever numpy, struct and str raise on broken text
         raise FormatError(f"{path}: is no {kind[1:]} file with triangles ({type(error).__name__}), expected a mesh") from error
+    if len(faces) > MAX_FACES or len(vertices) > 3 * MAX_FACES:
+        raise TooLargeError(f"{path}: {len(faces)} faces, expected {MAX_FACES} at the most; decimate the mesh")
     problem = fault(Mesh(vertices, faces))
     if problem:
         raise FormatError(f"{path}: {problem}")
-    mesh = _tidy(Mesh(vertices, faces))
+    is_heap = len(vertices) >= 3 * len(faces)  # of single triangles, as of an stl file: they get their common corners
+    mesh = _welded([Mesh(vertices, faces)]) if is_heap else _tidy(Mesh(vertices, faces))
     extent = float(np.ptp(mesh.vertices, axis=0).max())
     if not MIN_EXTENT <= extent <= MAX_EXTENT:
         raise FormatError(
@@ -138,13 +146,17 @@ def normals(mesh: Mesh) -> Array:
 
 
 def _tidy(mesh: Mesh) -> Mesh:
-    """Without vertices that no face has; a heap of single triangles, as of an stl file, gets its common corners."""
-    vertices, faces = mesh
-    if len(vertices) >= 3 * len(faces):
-        vertices, same = np.unique(vertices, axis=0, return_inverse=True)
-        faces = same.reshape(-1)[faces]
-    ordered = np.sort(faces, axis=1)
-    return _only(Mesh(vertices, faces), (ordered[:, 1:] != ordered[:, :-1]).all(axis=1))
+    """Without vertices that no face has, and without faces that have a corner twice."""
+    ordered = np.sort(mesh.faces, axis=1)
+    return _only(mesh, (ordered[:, 1:] != ordered[:, :-1]).all(axis=1))
+
+
+def _welded(meshes: Sequence[Mesh]) -> Mesh:
+    """One mesh of all, whose vertices at the same place are one."""
+    starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
+    faces = np.concatenate([mesh.faces + start for mesh, start in zip(meshes, starts)])
+    vertices, same = np.unique(np.concatenate([mesh.vertices for mesh in meshes]), axis=0, return_inverse=True)
+    return _tidy(Mesh(vertices, same.reshape(-1)[faces]))
 
 
 def with_area(mesh: Mesh) -> Mesh:
@@ -217,7 +229,19 @@ def hull(points: Array) -> Mesh:
 
 
 def pieces(mesh: Mesh) -> list[Mesh]:
-    """The pieces that share no vertices, in the order of the file, closed ones with their faces looking outwards."""
+    """The pieces that share no vertices, closed ones with their faces looking outwards.
+
+    Closed ones come first, in the order of the file. Of the others, vertices at the same place are taken for one: files that
+    keep normals, colours or single triangles have them several times. Closed pieces may well touch, and stay apart.
+    """
+    found = _split(mesh)
+    closed = [piece for piece in found if is_closed(piece)]
+    others = [piece for piece in found if not is_closed(piece)]
+    return [_outward(piece) for piece in (*closed, *(_split(_welded(others)) if others else []))]
+
+
+def _split(mesh: Mesh) -> list[Mesh]:
+    """The pieces that share no vertices, in the order of the file; the mesh itself if there are too many."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
@@ -226,8 +250,7 @@ def pieces(mesh: Mesh) -> list[Mesh]:
     links = np.concatenate(ends)
     count, label = connected_components(coo_matrix((np.ones(len(links)), links.T), (number, number)), directed=False)
     of_face = label[faces[:, 0]]
-    found = [mesh] if count > MAX_PIECES else [_only(mesh, of_face == piece) for piece in dict.fromkeys(of_face.tolist())]
-    return [_outward(piece) for piece in found]
+    return [mesh] if count > MAX_PIECES else [_only(mesh, of_face == piece) for piece in dict.fromkeys(of_face.tolist())]
 
 
 def _outward(mesh: Mesh) -> Mesh:
@@ -240,6 +263,24 @@ def convex_pieces(mesh: Mesh) -> list[Mesh] | None:
     if not all(is_convex(piece, NEARLY_CONVEX) for piece in found):
         return None
     return [piece if is_convex(piece) else hull(piece.vertices) for piece in found]
+
+
+def bounds(mesh: Mesh) -> Array:
+    """(2, 3) low and high corner of a mesh, m."""
+    return np.stack([mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)])
+
+
+def long_axis(mesh: Mesh, ratio: float = 3.0) -> Array | None:
+    """(3,) unit, along a piece that is so many times as long as it is thick, as a peg or a rod; None for others."""
+    middle = mesh.vertices - mesh.vertices.mean(axis=0)
+    axes = np.linalg.svd(middle, full_matrices=False)[2]
+    length, thickness, _ = np.ptp(middle @ axes.T, axis=0)
+    return np.asarray(axes[0]) if length >= ratio * thickness else None
+
+
+def scaled(mesh: Mesh, scale: float) -> Mesh:
+    """The mesh, larger about its origin."""
+    return Mesh(mesh.vertices * scale, mesh.faces)
 
 
 def centred(mesh: Mesh, by_mass: bool = False) -> tuple[Array, Array, Mesh]:

@@ -34,8 +34,8 @@ from typing import Any
 
 from dapdata import durable, engines, manifest, recipe, remote, store, tasks, units
 from dapdata.engines import Failure, Job
-from dapdata.errors import EnvironmentProblem, FormatError, LockedError, QuarantineError, RejectedError, UsageError, require
-from dapdata.manifest import MissingEntry
+from dapdata.errors import EnvironmentProblem, FormatError, LockedError, QuarantineError, UsageError, require
+from dapdata.manifest import MissingEntry, Progress
 from dapdata.plan import Before, Cost, Plan, before, make_plan, measured_cost, missing
 from dapdata.recipe import Recipe
 from dapdata.records import Cloud, Demo, Labels, Rejected, Superpoints
@@ -89,7 +89,7 @@ parse = recipe.from_resolved  # what a worker makes its recipe with
 
 # The commands ----------------------------------------------------------------------------------------------
 
-Progress = Callable[[int, int], None]  # demos done, demos in all
+OnProgress = Callable[[int, int], None]  # demos done, demos in all
 
 
 def generate(
@@ -103,7 +103,7 @@ def generate(
     allow_missing: bool = False,
     fresh: bool = False,
     dry_run: bool = False,
-    progress: Progress | None = None,
+    progress: OnProgress | None = None,
     table: str | None = None,
 ) -> Place | Plan:
     """Makes scenes, settled demonstrations and point clouds; goes on where an earlier call stopped.
@@ -151,7 +151,7 @@ def label(
     units: str | None = None,
     allow_missing: bool = False,
     dry_run: bool = False,
-    progress: Progress | None = None,
+    progress: OnProgress | None = None,
     table: str | None = None,
 ) -> Place | Plan:
     """Makes superpoints, affordance and correspondence of a generated dataset, and its shards. Never simulates.
@@ -166,13 +166,11 @@ def label(
     """
     place = remote.locate(dataset)
     with remote.working_copy(place, units=True) as root:
-        found = manifest.read(root)
+        found = _generated(root)
         given = recipe.from_resolved(found.recipe, overrides, str(root / manifest.MANIFEST))
         table = table or given.scene.stages
         stages, resolved = import_module(table).STAGES, recipe.resolve(given)
-        made = {name: entry.spec for name, entry in found.stages.items() if name in GENERATE and entry.units}
-        if made.keys() != set(GENERATE):
-            raise FormatError(f"{root}: stages {sorted(made)}, expected {', '.join(GENERATE)}; run `dapdata generate` first")
+        made = {name: found.specs[name] for name in GENERATE}
         _refuse_upstream(found.recipe, resolved, made)
         lost = tuple(entry for entry in found.missing if entry.stage in GENERATE)
         command = _Command(place, root, table, stages, LABEL, given, resolved, specs(stages, resolved) | made, units, lost)
@@ -184,14 +182,42 @@ def attach(dataset: str | Path, pictures: Mapping[str, bytes]) -> None:
     """Adds pictures, by their path such as "preview/goals.png", to a labelled dataset, its manifest and its card."""
     root = Path(dataset)
     with durable.disk_problems(remote.scratch_of(root)), durable.lock(root):
+        found = manifest.read(root)
+        specs, stages = {name: entry.spec for name, entry in found.stages.items()}, list(LABEL)
+        last = next(stage.name for stage in STAGES if stage.is_shard)
+        left = Progress(recipe=found.recipe, specs=specs, stages=stages, shard_stage=last, missing=found.missing)
+        _note(root, left)
         units.attach(root, pictures)
+
+
+def _generated(root: Path) -> Before:
+    """What a generated dataset was made for: from its manifest, or from what an interrupted `label` left of that."""
+    try:
+        found = manifest.read(root)
+        specs = {name: entry.spec for name, entry in found.stages.items() if entry.units}
+        made = Before(found.recipe, specs, tuple(found.missing))
+    except FormatError:
+        left = manifest.read_progress(root)
+        if (root / manifest.MANIFEST).exists() or left is None or left.stages != list(LABEL):
+            raise
+        made = Before(left.recipe, left.specs, tuple(left.missing))
+    if not made.specs.keys() >= {*GENERATE}:
+        raise FormatError(f"{root}: stages {sorted(made.specs)}, expected {', '.join(GENERATE)}; run `dapdata generate` first")
+    return made
+
+
+def _note(root: Path, progress: Progress) -> None:
+    """Writes down what a command works on, for whoever goes on after a crash."""
+    data, path = json.dumps(progress.model_dump(mode="json")).encode(), root / manifest.PROGRESS
+    if not path.is_file() or path.read_bytes() != data:
+        durable.replace_file(path, data)
 
 
 def _refuse_upstream(old: Mapping[str, Any], new: Mapping[str, Any], made: Mapping[str, Spec]) -> None:
     """Relabelling doesn't simulate: what earlier stages read cannot be changed here."""
     fixed = ["name", "seed", "demos", "shard_size", *(section for spec in made.values() for section in spec["sections"])]
     for name in fixed:
-        if old[name] != new[name]:
+        if old.get(name) != new.get(name):
             raise UsageError(
                 f"--set {name}: `dapdata label` does not simulate or observe again; change it with `dapdata generate`"
             )
@@ -205,7 +231,7 @@ class _Means:
     engine: str
     memory: float | None
     allow_missing: bool
-    progress: Progress | None
+    progress: OnProgress | None
     fresh: bool = False
 
 
@@ -255,7 +281,7 @@ class _Command:
 
     def run(self, means: _Means) -> Place:
         """Makes the missing units; publishes what is there then, or leaves that to whoever makes the others."""
-        _check_packages(stage for stage in self.stages if stage.name in self.wanted)
+        check_packages(stage for stage in self.stages if stage.name in self.wanted)
         engine, needed = engines.get(means.engine), int(self.plan(means.fresh).gigabytes * 1e9)
         _check_space(self.root, needed)
         with durable.disk_problems(remote.scratch_of(self.root), needed):
@@ -280,8 +306,7 @@ class _Command:
         jobs = self._jobs(needed)
         if not jobs:
             return
-        left = {"recipe": self.resolved, "specs": self.specs, "stages": self.wanted, "shard_stage": self.layout.shard_stage}
-        durable.replace_file(self.root / manifest.PROGRESS, json.dumps(left).encode())  # specs stay in their order
+        self._note()
         if self.stripe is None and (self.root / QUARANTINE).is_dir():
             durable.discard(self.root, self.root / QUARANTINE)
         for unit in jobs.values():
@@ -292,6 +317,11 @@ class _Command:
             if self.stripe is None:
                 _leave_nothing(self.root)
             raise
+
+    def _note(self) -> None:
+        """Writes down what this command works on."""
+        stages, last, lost = list(self.wanted), self.layout.shard_stage, list(self.lost)
+        _note(self.root, Progress(recipe=self.resolved, specs=self.specs, stages=stages, shard_stage=last, missing=lost))
 
     def _jobs(self, needed: int) -> dict[str, Unit]:
         """The units of which something is missing, by their job."""
@@ -320,7 +350,7 @@ class _Command:
 
         advance()
         memory = None if means.memory is None else means.memory * 1e9
-        queue = [Job(text, START_TIMEOUT + DEMO_TIMEOUT * (unit.stop - unit.start), memory) for text, unit in jobs.items()]
+        queue = [Job(text, timeout(unit), memory) for text, unit in jobs.items()]
         failures = engine.run(units.CALL, queue, workers=means.workers, on_done=on_done)
         self._wait_for(unit for text, unit in jobs.items() if text not in left)
         if failures:
@@ -408,13 +438,14 @@ class _Command:
         without = self._missing(means)
         if without is None:
             return
+        self._note()  # of what is published, should that be interrupted
         if len(without) == len(self._all_units):
             raise QuarantineError(f"{self.root}: all units failed ({without[0].reason}), expected some that did not")
         now = units.publish(self.layout, self.stages, self.resolved, self.recipe.split, self._all_units, without)
         tried = now.demos - sum(stop - start for start, stop in (entry.demo_range for entry in without))
         if sum(now.rejects.demos.values()) >= tried:
             reasons = ", ".join(f"{reason} {count}" for reason, count in now.rejects.demos.items())
-            raise RejectedError(
+            raise UsageError(
                 f"{self.root}: all {tried} demos were rejected ({reasons}), expected some that are not; "
                 f"{self.recipe.scene.remedy}"
             )
@@ -435,16 +466,21 @@ REFERENCE_COST: dict[str, Cost] = {  # s and bytes a demo at 320x240, until this
 }
 
 
+def timeout(unit: Unit) -> float:
+    """Seconds after which a unit is given up."""
+    return START_TIMEOUT + DEMO_TIMEOUT * (unit.stop - unit.start)
+
+
 def _check_folder(root: Path) -> None:
     """Refuses to write among somebody's other files."""
-    ours = (manifest.MANIFEST, manifest.PROGRESS, manifest.INDEX, ".lock", "stages")
+    ours = (manifest.MANIFEST, manifest.PROGRESS, manifest.LOG, manifest.INDEX, "stages", "shards", QUARANTINE)
     if root.exists() and not root.is_dir():
         raise FormatError(f"{root}: a file, expected a folder for the dataset; choose another with --out")
-    if root.is_dir() and any(root.iterdir()) and not any((root / name).exists() for name in ours):
+    if durable.is_occupied(root) and not any((root / name).exists() for name in ours):
         raise FormatError(f"{root}: a folder with other files and no dataset; choose an empty or new one with --out")
 
 
-def _check_packages(stages: Iterable[Stage]) -> None:
+def check_packages(stages: Iterable[Stage]) -> None:
     """Raises a MissingExtraError before anything is written if a stage needs a package that is not installed."""
     for package in (package for stage in stages for package in stage.packages):
         if find_spec(package) is None:
@@ -475,7 +511,7 @@ def _clear(root: Path) -> None:
 
 def _leave_nothing(root: Path) -> None:
     """Removes a folder in which no unit was finished: a recipe that admits no demo leaves no trace."""
-    if not any(path.name != ".lock" and path.name != manifest.PROGRESS for path in root.iterdir()):
+    if not any(path.name != durable.LOCK and path.name != manifest.PROGRESS for path in root.iterdir()):
         durable.remove_file(root / manifest.PROGRESS)
         shutil.rmtree(root)
 

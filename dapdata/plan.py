@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import Any
 
 from dapdata import manifest, store
 from dapdata.errors import CorruptionError, FormatError
+from dapdata.manifest import MissingEntry
 from dapdata.stages import Layout, Spec, Stage, Unit, changes
 
 LOG_LINES = 400  # the latest units tell what a demo costs now
@@ -61,6 +61,7 @@ class Before:
 
     recipe: dict[str, Any]
     specs: dict[str, Spec]
+    missing: tuple[MissingEntry, ...] = ()  # units that failed
 
 
 def before(root: Path) -> Before | None:
@@ -73,11 +74,8 @@ def before(root: Path) -> Before | None:
     except FormatError:
         if (root / manifest.MANIFEST).is_file():
             raise
-    try:
-        left = json.loads((root / manifest.PROGRESS).read_bytes())
-        return Before(left["recipe"], left["specs"])
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
+    left = manifest.read_progress(root)
+    return Before(left.recipe, left.specs) if left else None
 
 
 def missing(layout: Layout, stage: str, units: Sequence[Unit]) -> list[Unit]:
@@ -92,7 +90,7 @@ def measured_cost(root: Path, reference: Mapping[str, Cost]) -> dict[str, Cost]:
     lines = list(manifest.read_log(root, LOG_LINES))
     costs = dict(reference)
     for stage in reference:
-        mine = [line for line in lines if line.get("stage") == stage and line["demos"]]
+        mine = [line for line in lines if line["stage"] == stage and line["demos"]]
         if mine:
             demos = sum(line["demos"] for line in mine)
             costs[stage] = (sum(line["cpu_seconds"] for line in mine) / demos, sum(line["bytes"] for line in mine) / demos)

@@ -8,7 +8,7 @@ that is told K judges the ranks below K; the modes are counted on all.
 
 from __future__ import annotations
 
-import zipfile
+import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from hashlib import sha256
@@ -18,12 +18,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dapdata import durable
 from dapdata.errors import FormatError
+from dapdata.npz import read_arrays
 from dapdata.records import Placement
 
 Array = NDArray[Any]
 
-LARGEST = 128_000_000  # bytes of one array: a million poses
 REQUIRED = ("demo", "rank", "T_world_object", "score")
 ROTATION_ERROR = 1e-3  # largest entry of R^T R - I that still is a rotation, in a file written as float32
 
@@ -83,19 +84,23 @@ def _worse(placement: Placement) -> tuple[bool, float]:
 
 
 def write(path: str | Path, predictions: Predictions) -> Path:
-    """Writes the file, whole or not at all, and returns its path."""
-    path = Path(path)
-    staged = path.with_name(f".{path.name}.part")
-    with staged.open("wb") as file:
-        np.savez(
-            file,
-            demo=predictions.demo,
-            rank=predictions.rank,
-            T_world_object=predictions.T_world_object,
-            score=predictions.score,
-            status=predictions.status.astype(str),
-        )
-    return staged.replace(path)
+    """Writes the file, whole or not at all, and returns its path.
+
+    Raises:
+        EnvironmentProblem: if the disk is full.
+    """
+    path, file = Path(path), io.BytesIO()
+    np.savez(
+        file,
+        demo=predictions.demo,
+        rank=predictions.rank,
+        T_world_object=predictions.T_world_object,
+        score=predictions.score,
+        status=predictions.status.astype(str),
+    )
+    with durable.disk_problems(path.parent, file.tell()):
+        durable.replace_file(path, file.getvalue())
+    return path
 
 
 def read(path: str | Path) -> Predictions:
@@ -105,7 +110,7 @@ def read(path: str | Path) -> Predictions:
         FormatError: not an npz, missing or misshaped arrays, poses that are neither rigid nor flagged, repeated ranks.
     """
     path = Path(path)
-    arrays = _load(path)
+    arrays = read_arrays(path, REQUIRED, ("status",))
     demo, rank, T, score = (arrays[name] for name in REQUIRED)
     number = len(demo) if demo.ndim else 0
     shapes = {"demo": (number,), "rank": (number,), "T_world_object": (number, 4, 4), "score": (number,), "status": (number,)}
@@ -148,42 +153,3 @@ def _check_rows(path: Path, demo: Array, rank: Array, T: Array, score: Array, st
     if (counts > 1).any():
         twice, again = pairs[np.argmax(counts > 1)]
         raise FormatError(f"{path}: demo {twice} has rank {again} more than once, expected each rank once; 0 is the best")
-
-
-def _load(path: Path) -> dict[str, Array]:
-    """The arrays of the npz by name; sizes are checked before anything is allocated, nothing is unpickled."""
-    if not path.is_file():
-        raise FormatError(f"{path}: no such file, expected an npz with {', '.join(REQUIRED)}")
-    try:
-        with zipfile.ZipFile(path) as archive:
-            members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
-            for name in REQUIRED:
-                if name not in members:
-                    raise FormatError(f"{path}: got {sorted(members)[:8]}, expected arrays {', '.join(REQUIRED)}")
-            return {n: _array(path, archive, n, members[n]) for n in (*REQUIRED, "status") if n in members}
-    except (zipfile.BadZipFile, ValueError, OSError, EOFError, NotImplementedError, RuntimeError, SyntaxError) as error:
-        if isinstance(error, FormatError):
-            raise
-        reason = str(error).splitlines()[0][:120] if str(error) else type(error).__name__
-        raise FormatError(f"{path}: cannot be read as npz ({reason}); write it with numpy.savez, without objects") from error
-
-
-def _array(path: Path, archive: zipfile.ZipFile, name: str, info: zipfile.ZipInfo) -> Array:
-    """One member as an array, refused when it is huge, lies about its size, or holds Python objects."""
-    if info.file_size > LARGEST:
-        raise FormatError(f"{path}: {name}: got {info.file_size} bytes, expected at most {LARGEST}")
-    with archive.open(info) as file:
-        version = np.lib.format.read_magic(file)
-        readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-        if version not in readers:
-            raise FormatError(f"{path}: {name}: got npy version {version}, expected 1.0 or 2.0")
-        shape, fortran, dtype = readers[version](file)
-        if dtype.hasobject or dtype.kind not in "iufU" or (dtype.itemsize > 1024):
-            raise FormatError(f"{path}: {name}: got {dtype}, expected plain numbers or text; nothing is unpickled")
-        count = 1
-        for length in shape:  # Python integers: a numpy product would overflow on a lying header
-            count *= int(length)
-        data = file.read(count * dtype.itemsize + 1) if count * dtype.itemsize <= LARGEST else b""
-    if len(data) != count * dtype.itemsize:
-        raise FormatError(f"{path}: {name}: got {info.file_size} bytes, expected {shape} of {dtype}; the file is cut short")
-    return np.frombuffer(data, dtype).reshape(shape, order="F" if fortran else "C")

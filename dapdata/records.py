@@ -76,6 +76,7 @@ class Rejected:
     """Why a demo (or an attempt at one) came to nothing: data to be counted, not an error."""
 
     reason: str
+    detail: str = field(default="", compare=False)  # for who looks after it, such as the file or the figure
 
 
 @dataclass(frozen=True)
@@ -290,12 +291,24 @@ def read_demo(sample: Mapping[str, Array]) -> Demo:
 
 
 def to_sample(*records: Record) -> dict[str, Array]:
-    """One demo's arrays by path, in the stored dtype; the inverse of `read_record`."""
+    """One demo's arrays by path, in the stored dtype; the inverse of `read_record`.
+
+    Raises:
+        ValueError: if a number is no integer, or too large, for an array of integers.
+    """
     return {
-        c.metadata["path"]: np.asarray(getattr(record, c.name), dtype=c.metadata["dtype"])
+        c.metadata["path"]: _stored(c.metadata["path"], getattr(record, c.name), np.dtype(c.metadata["dtype"]))
         for record in records
         for c in fields(record)
     }
+
+
+def _stored(path: str, value: Any, dtype: np.dtype[Any]) -> Array:
+    with np.errstate(invalid="ignore", over="ignore"):  # what overflows is found below, or by `store.problems`
+        array = np.asarray(value, dtype=dtype)
+    if dtype.kind in "iu" and not np.array_equal(array, value):
+        raise ValueError(f"{path}: numbers that {dtype.name} cannot hold")
+    return array
 
 
 class Mesh(NamedTuple):

@@ -167,6 +167,22 @@ def record(
     return demo
 
 
+def ways_out(scene: Scene | Demo, T_container_object: Array, ways: Array, config: PlacementConfig) -> Array:
+    """(G, 3) the first of some ways out against which the judge's motion brings each object in; the first where none does.
+
+    Args:
+        scene: What the container, its clutter and the object look like.
+        T_container_object: (G, 4, 4) poses at rest.
+        ways: (W, 3) or, for each object its own, (G, W, 3) unit, container frame.
+        config: Mass and friction.
+    """
+    world, found = _World(scene, config), np.zeros((len(T_container_object), 3))
+    for g, (T, mine) in enumerate(zip(T_container_object, np.broadcast_to(ways, (len(T_container_object), *ways.shape[-2:])))):
+        free = (way for way in mine if _approach(world, T, way).T_release is not None)
+        found[g] = next(free, mine[0])
+    return found
+
+
 def drop(scene: Scene | Demo, T_container_object: Array, config: PlacementConfig, seconds: float) -> Array:
     """(G, 4, 4) where objects come to that are let go at (G, 4, 4) poses, container frame, after so many seconds."""
     world = _World(scene, config)
@@ -534,7 +550,7 @@ class _World:
         for name, arrays, found in (("container part", parts, part_meshes), ("object part", self._object, self._object_meshes)):
             _check_parts(name, found, *arrays)
         self._T_object_body = _object_body(self._object, self._object_meshes)
-        self._bounds = solids.bounds(*parts)  # (P, 2, 3)
+        self._bounds = _bounds(parts, part_meshes)  # (P, 2, 3)
         container = self._bounds[np.asarray(scene.part_role) == ROLES.index("container")]
         self._inside = np.stack([container[:, 0].min(axis=0), container[:, 1].max(axis=0)])
         self._bullet, self._client = _client(os.getpid())
@@ -721,7 +737,7 @@ class _World:
     def _object_bounds(self, T: Array) -> Array:
         """(2, 3) low and high corner of the object's bounding box at T."""
         kind, size, T_object_part = self._object
-        each = solids.bounds(kind, size, T @ T_object_part)
+        each = _bounds((kind, size, T @ T_object_part), self._object_meshes)
         return np.stack([each[:, 0].min(axis=0), each[:, 1].max(axis=0)])
 
     # Copies that fall
@@ -765,6 +781,16 @@ def _object_body(parts: tuple[Array, ...], found: Sequence[Mesh | None]) -> Arra
     if volumes:  # each piece of an object has its origin at its own centre of mass
         return pose(None, np.average(T_object_part[:, :3, 3], axis=0, weights=volumes))
     return pose(None, solids.centre_of_mass(kind, size, T_object_part))
+
+
+def _bounds(parts: tuple[Array, ...], found: Sequence[Mesh | None]) -> Array:
+    """(P, 2, 3) the smallest axis-aligned boxes around parts of any kind."""
+    kind, size, T = parts
+    around = solids.bounds(kind, size, T)
+    for p, mesh in enumerate(found):
+        if mesh is not None:
+            around[p] = meshes.bounds(Mesh(transform(T[p], mesh.vertices), mesh.faces))
+    return around
 
 
 def _places(scene: Scene | Demo) -> Array:

@@ -10,29 +10,40 @@ Codecs: sharding, zstd, and crc32c last, so that plain zarr refuses a flipped ch
 
 from __future__ import annotations
 
-import json
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from contextlib import suppress
 from dataclasses import Field, dataclass, field
 from hashlib import sha256
 from importlib.metadata import version
+from math import prod
 from pathlib import Path
-from typing import Any
+from stat import S_ISDIR, S_ISREG
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import AfterValidator, BaseModel, ValidationError
+from pydantic import Field as Key
 
 from dapdata import durable
 from dapdata.errors import CorruptionError
-from dapdata.records import PART_KINDS, RECORDS, Array, Meshes, Record, columns, is_ragged
+from dapdata.records import PART_KINDS, RECORDS, SYMMETRIES, Array, Meshes, Record, columns, is_ragged
 
 FORMAT = 1
 MAX_CHUNK_ROWS = 32768  # fewer rows in a chunk make reading and writing slower, more make nothing faster
 ZSTD_LEVEL = 1  # observed coordinates are noise: level 3 is no smaller
-MAX_RATIO = 1000  # decoded to stored bytes of an array: more is no data of ours but a bomb
-SMALL = 1 << 26  # bytes: arrays up to this are decoded whatever their ratio
+MAX_RATIO = 100  # decoded to stored bytes of a unit: more is no data of ours but a bomb
+SMALL = 1 << 28  # bytes: units up to this are decoded whatever their ratio
 TOLERANCE = 1e-3  # of stored float32 normals
 RIGID_TOLERANCE = 1e-6  # of float64 poses
+DIRECTIONS = ("normals", "opening", "approach")  # arrays of unit vectors; so is symmetry/axis, where it matters
+POSITIVE = {  # arrays in which nothing is below this
+    "scene/size": 0, "object_parts/size": 0, "scene/max_tilt": 0, "goals/clearance": 0, "correspondence/distance": 0,
+    "container_superpoints/size": 1, "object_superpoints/size": 1, "meta/demo": 0, "meta/seed": 0,
+}  # fmt: skip
+CODECS = ["bytes", "zstd", "crc32c"]
+
+REVOLUTION = SYMMETRIES.index("revolution")
 
 Sample = dict[str, Array]  # one demo's arrays by path, without offsets
 RecordType = type[Record]
@@ -54,7 +65,13 @@ class Block:
     demos: int
 
     def sample(self, row: int) -> Sample:
-        """The arrays of one demo by path: views, not copies."""
+        """The arrays of one demo by path: views, not copies.
+
+        Raises:
+            CorruptionError: if there is no such demo.
+        """
+        if not 0 <= row < self.demos:
+            raise CorruptionError(f"demo {row} of a shard, expected 0 to {self.demos - 1}; run `dapdata verify`")
         return {
             path: np.asarray(array[self._rows(path, row)])
             for path, array in self.arrays.items()
@@ -129,6 +146,8 @@ def problems(sample: Sample) -> Iterator[str]:
             if rows.setdefault(group, len(array)) != len(array):
                 yield f"{path}: {len(array)} rows, expected {rows[group]} as in the rest of {group}"
         yield from _value_problems(path, array, about)
+    if "symmetry/kind" in sample and int(sample["symmetry/kind"]) == REVOLUTION and not is_unit(sample["symmetry/axis"]):
+        yield "symmetry/axis: not a unit vector, and the object is one of revolution"
     for path, target in INDEX_INTO.items():
         if path in sample and target in rows and sample[path].size:
             low, high = int(sample[path].min()), int(sample[path].max())
@@ -155,7 +174,7 @@ def _value_problems(path: str, array: Array, about: Mapping[str, Any]) -> Iterat
         return
     if array.dtype.kind == "f" and not np.isfinite(array).all():
         yield f"{path}: {int((~np.isfinite(array)).sum())} values are not finite"
-    elif name == "normals" and np.abs(np.einsum("ni,ni->n", array, array) - 1).max() > 2 * TOLERANCE:
+    elif name in DIRECTIONS and not is_unit(array):
         yield f"{path}: not unit vectors"
     elif about["dims"][-2:] == (4, 4) and not is_rigid(array):
         yield f"{path}: not rigid transforms"
@@ -163,6 +182,13 @@ def _value_problems(path: str, array: Array, about: Mapping[str, Any]) -> Iterat
         yield f"{path}: code {int(array.max())}, expected below {len(about['names'])}"
     elif name == "affordance" and np.abs(array).max() > 1:
         yield f"{path}: {float(array.min())} to {float(array.max())}, expected -1 to 1"
+    elif array.min() < POSITIVE.get(path, -np.inf):
+        yield f"{path}: {array.min()}, expected at least {POSITIVE[path]}"
+
+
+def is_unit(vectors: Array) -> bool:
+    """Whether all of (..., 3) have length 1, but for the rounding of float32."""
+    return bool(np.abs(np.einsum("...i,...i->...", vectors, vectors) - 1).max() <= 2 * TOLERANCE)
 
 
 def is_rigid(transforms: Array) -> bool:
@@ -246,7 +272,7 @@ def _concatenated(column: Field[Any], samples: Sequence[Sample]) -> Array:
 def _write_array(group: Any, path: str, array: Array) -> None:
     from zarr.codecs import Crc32cCodec, ZstdCodec
 
-    about = COLUMNS[path].metadata if path in COLUMNS else _offsets_about(path)
+    about = _about(path)
     rows = max(len(array), 1)
     chunk = min(rows, MAX_CHUNK_ROWS)
     target = group.create_array(
@@ -257,26 +283,31 @@ def _write_array(group: Any, path: str, array: Array) -> None:
         shards=(-(-rows // chunk) * chunk, *array.shape[1:]),
         compressors=[ZstdCodec(level=ZSTD_LEVEL), Crc32cCodec()],
         fill_value={"f": np.nan, "i": -1, "u": np.iinfo(np.uint8).max}[array.dtype.kind],
-        dimension_names=[about["dims"][0], *_axis_names(about["dims"][1:])],
-        attributes={key: about[key] for key in ("unit", "frame", "description")} | _named_codes(about),
+        dimension_names=_dimension_names(about),
+        attributes=_attributes(about),
         config={"write_empty_chunks": True},
     )
     if len(array):
         target[...] = array
 
 
-def _offsets_about(path: str) -> dict[str, Any]:
+def _about(path: str) -> Mapping[str, Any]:
+    """What the table of records says of an array; offsets are alike in all groups."""
+    if path in COLUMNS:
+        return COLUMNS[path].metadata
     description = "rows offsets[d] to offsets[d + 1] of this group are demo d's"
-    return {"dims": ("demo_edge",), "unit": "1", "frame": "-", "description": description, "names": ()}
+    return {"dtype": "<i8", "dims": ("demo_edge",), "unit": "1", "frame": "-", "description": description, "names": ()}
 
 
-def _named_codes(about: Mapping[str, Any]) -> dict[str, Any]:
-    return {"names": list(about["names"])} if about["names"] else {}
+def _attributes(about: Mapping[str, Any]) -> dict[str, Any]:
+    codes = {"names": list(about["names"])} if about["names"] else {}
+    return {key: about[key] for key in ("unit", "frame", "description")} | codes
 
 
-def _axis_names(dims: tuple[Any, ...]) -> list[str]:
-    """(3,) is "xyz"; matrices have a row and a column."""
-    return ["xyz"] if len(dims) == 1 else ["row", "column"][: len(dims)]
+def _dimension_names(about: Mapping[str, Any]) -> list[str]:
+    """Rows; then (3,) is "xyz", and matrices have a row and a column."""
+    fixed = about["dims"][1:]
+    return [about["dims"][0], *(["xyz"] if len(fixed) == 1 else ["row", "column"][: len(fixed)])]
 
 
 def _borrow(folder: Path, path: str, lender: Lender) -> dict[str, dict[str, Any]]:
@@ -303,7 +334,7 @@ def _hash_all(folder: Path) -> dict[str, dict[str, Any]]:
 
 def lender(folder: Path, record: Mapping[str, Any]) -> Lender:
     """A committed unit as a lender of all arrays that it holds."""
-    return Lender(folder, record["files"], frozenset(_stored(record)))
+    return Lender(folder, record["files"], frozenset(stored_paths(record)))
 
 
 # Reading ---------------------------------------------------------------------------------------------------
@@ -329,6 +360,33 @@ def committed(root: Path, paths: Iterable[str]) -> set[str]:
     return wanted & found
 
 
+def _relative(name: str) -> str:
+    """The name of a file that is inside of the unit."""
+    if ".." in name.split("/") or name.startswith("/") or not name.isprintable():
+        raise ValueError("a file outside of the unit")
+    return name
+
+
+class _File(BaseModel):
+    sha256: str
+    bytes: int = Key(ge=0)
+
+
+class _Row(BaseModel):
+    demo: int = Key(ge=0)
+    sha256: str
+
+
+class UnitRecord(BaseModel):
+    """The unit's own record, as far as reading relies on it; rows of shards hold what `units.describe` says too."""
+
+    format: int = FORMAT
+    key: str
+    rows: list[_Row]
+    rejects: dict[str, dict[str, int]] = {}
+    files: dict[Annotated[str, AfterValidator(_relative)], _File]
+
+
 def read_record(folder: Path) -> dict[str, Any]:
     """The unit's own record: key, demos, rejects, files.
 
@@ -336,12 +394,19 @@ def read_record(folder: Path) -> dict[str, Any]:
         CorruptionError: if the root is missing, is no JSON, or holds no such record.
     """
     try:
-        record: dict[str, Any] = json.loads((folder / "zarr.json").read_bytes())["attributes"]["dapdata"]
-        if any(".." in name.split("/") or name.startswith("/") for name in record["files"]):
-            raise ValueError("a file outside of the unit")
-        return {**record, "files": dict(record["files"]), "rows": list(record["rows"])}
+        record: dict[str, Any] = durable.read_json(folder / "zarr.json")["attributes"]["dapdata"]
+        if (found := UnitRecord.model_validate(record, strict=True).format) != FORMAT:
+            raise ValueError(f"format {found}, expected {FORMAT}")
+        return record
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise CorruptionError(f"{folder}/zarr.json: cannot be read as a unit ({error}); run `dapdata verify`") from error
+        reason = _first(error) if isinstance(error, ValidationError) else str(error)
+        raise CorruptionError(f"{folder}/zarr.json: cannot be read as a unit ({reason}); run `dapdata verify`") from error
+
+
+def _first(error: ValidationError) -> str:
+    """The first of pydantic's complaints in a line."""
+    found = error.errors()[0]
+    return f"{'.'.join(map(str, found['loc']))}: {found['msg']}"
 
 
 def damaged_files(folder: Path, record: Mapping[str, Any]) -> Iterator[str]:
@@ -355,7 +420,7 @@ def damaged_files(folder: Path, record: Mapping[str, Any]) -> Iterator[str]:
     present.pop("zarr.json", None)
     for name, fact in record["files"].items():
         path = present.pop(name, None)
-        if path is None or path.is_symlink():
+        if path is None or path.is_symlink() or not path.is_file():
             yield f"{name}: missing"
         elif path.stat().st_size != fact["bytes"]:
             yield f"{name}: {path.stat().st_size} bytes, expected {fact['bytes']}"
@@ -376,38 +441,117 @@ def read_block(folder: Path, paths: Sequence[str] | None = None) -> Block:
     path = "zarr.json"
     try:
         record = read_record(folder)
-        group = zarr.open_group(folder, mode="r")
-        for path in _stored(record) if paths is None else _with_offsets(paths):
-            arrays[path] = _decoded(folder, group, path, record["files"])
-    except (OSError, ValueError, KeyError, TypeError, RuntimeError) as error:
+        group: Any = zarr.open_group(folder, mode="r")
+        wanted = stored_paths(record) if paths is None else _with_offsets(paths)
+        names = {*files_of(record, paths)}
+        _check_arrays(group, wanted, names, _check_files(folder, names))
+        for path in wanted:
+            arrays[path] = group[path][...]
+        for path in wanted:
+            _check_rows(path, arrays, len(record["rows"]))
+    except Exception as error:  # there is no end to what zarr and its codecs raise at bytes that are not theirs
         raise CorruptionError(
-            f"{folder}: {path}: cannot be decoded ({error}); expected the bytes that were written: run `dapdata verify`"
+            f"{folder}: {path}: cannot be decoded ({_one_line(error)}), expected what was written; run `dapdata verify`"
         ) from error
     return Block(arrays, len(record["rows"]))
 
 
 def files_of(record: Mapping[str, Any], paths: Sequence[str] | None = None) -> list[str]:
-    """The files of a unit that `read_block` needs besides the root: those of some arrays and their offsets, or all."""
+    """The files of a unit that `read_block` looks at besides the root: those of some arrays and their offsets, or all."""
     wanted = "" if paths is None else tuple(f"{path}/" for path in _with_offsets(paths))
     return [name for name in record["files"] if name.startswith(wanted)]
 
 
-def _stored(record: Mapping[str, Any]) -> list[str]:
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())[:200] or type(error).__name__
+
+
+def stored_paths(record: Mapping[str, Any]) -> list[str]:
     """Paths of the arrays of a unit that this version knows, offsets included."""
     names = [name.removesuffix("/zarr.json") for name in record["files"] if name.count("/") == 2]
     return [name for name in names if name in COLUMNS or name.endswith("/offsets")]
 
 
-def _decoded(folder: Path, group: Any, path: str, names: Mapping[str, Any]) -> Array:
-    """One array; zarr reads a chunk that isn't there as fill values, so files that should be there are looked for."""
+def _check_files(folder: Path, names: Set[str]) -> int:
+    """The size of a unit's files, bytes; raises unless all are there, and the folders between lead nowhere else."""
+    for parent in {name.rsplit("/", up)[0] for name in names for up in range(1, name.count("/") + 1)}:
+        if not S_ISDIR((folder / parent).lstat().st_mode):
+            raise ValueError(f"{parent}: expected a folder")
+    total = 0
     for name in names:
-        if name.startswith(f"{path}/") and not (folder / name).is_file():
-            raise FileNotFoundError(f"{name} is missing")
-    stored = sum((folder / name).stat().st_size for name in names if name.startswith(f"{path}/"))
-    if group[path].nbytes > max(SMALL, MAX_RATIO * stored):
-        raise ValueError(f"{group[path].nbytes} bytes in {stored} of file")
-    array: Array = group[path][...]
-    return array
+        about = (folder / name).lstat()
+        if not S_ISREG(about.st_mode):
+            raise ValueError(f"{name}: expected a plain file")
+        total += about.st_size
+    return total
+
+
+def _check_arrays(group: Any, paths: Sequence[str], names: Set[str], stored: int) -> None:
+    """Raises a ValueError if arrays are others than they should be, or would take more memory than their files explain.
+
+    zarr reads a chunk that isn't there as fill values, so that one file of each array is looked for.
+    """
+    limit, total = max(SMALL, MAX_RATIO * stored), 0
+    for path in paths:
+        array, about = group[path], _about(path)
+        fixed = about["dims"][1:]
+        if array.dtype.str != about["dtype"] or array.shape[1:] != fixed or array.ndim != 1 + len(fixed):
+            raise ValueError(f"{path}: {array.dtype} {array.shape}, expected {about['dtype']} {(about['dims'][0], *fixed)}")
+        chunk = array.shards or array.chunks
+        if chunk[0] < array.shape[0] or chunk[1:] != array.shape[1:]:
+            raise ValueError(f"{path}: chunks of {chunk}, expected the whole of {array.shape} in one file")
+        if array.shape[0] and f"{path}/{array.metadata.encode_chunk_key((0,) * array.ndim)}" not in names:
+            raise FileNotFoundError(f"{path}: its rows are missing")
+        total += array.dtype.itemsize * prod(chunk)
+        if total > limit:
+            raise ValueError(f"{path}: {total} bytes in {stored} bytes of files")
+
+
+def _check_rows(path: str, arrays: Mapping[str, Array], demos: int) -> None:
+    """Raises a ValueError unless an array has a row for each demo, or as many as the offsets of its group share out."""
+    array = arrays[path]
+    if path.endswith("/offsets"):
+        if len(array) != demos + 1 or array[0] != 0 or (array[1:] < array[:-1]).any():
+            raise ValueError(f"offsets are not {demos + 1} numbers that rise from 0")
+    else:
+        expected = int(arrays[offsets_path(path)][-1]) if is_ragged(COLUMNS[path]) else demos
+        if len(array) != expected:
+            raise ValueError(f"{len(array)} rows, expected {expected}")
+
+
+def misdescribed(folder: Path) -> Iterator[str]:
+    """What the arrays of a unit say of themselves and should not, each as "path: found, expected".
+
+    Descriptions are worded anew now and then, and lists of codes' names grow: neither is wrong in an older dataset.
+
+    Raises:
+        CorruptionError: if there is no unit, or none that zarr can open.
+    """
+    import zarr
+
+    record = read_record(folder)
+    try:
+        group = zarr.open_group(folder, mode="r")
+        found: dict[str, Any] = {path: group[path].metadata.to_dict() for path in stored_paths(record)}
+    except Exception as error:  # as in read_block
+        raise CorruptionError(f"{folder}: cannot be opened ({_one_line(error)}); run `dapdata verify`") from error
+    for path, about in found.items():
+        codecs = [codec["name"] for codec in about["codecs"][0].get("configuration", {}).get("codecs", ())]
+        told = {**about["attributes"], "dimension_names": list(about.get("dimension_names") or ()), "codecs": codecs}
+        expected = {**_attributes(_about(path)), "dimension_names": _dimension_names(_about(path)), "codecs": CODECS}
+        for name in sorted((told | expected).keys() - {"description"}):
+            if not _says(told.get(name), expected.get(name), grows=name == "names"):
+                yield f"{path}: {name} {told.get(name)!r}, expected {expected.get(name)!r}"
+
+
+def _says(told: Any, expected: Any, grows: bool) -> bool:
+    """Whether an array is described as expected; where a list `grows`, its end may not have been there yet."""
+    return bool(told == expected or (grows and isinstance(told, list) and told and told == (expected or [])[: len(told)]))
+
+
+def array_paths(record: Mapping[str, Any]) -> list[str]:
+    """Paths of the arrays of a unit that this version knows, but for offsets."""
+    return [path for path in stored_paths(record) if path in COLUMNS]
 
 
 def _with_offsets(paths: Sequence[str]) -> list[str]:

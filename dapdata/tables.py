@@ -10,6 +10,7 @@ import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from stat import S_ISREG
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,8 @@ from dapdata.errors import CorruptionError, FormatError
 from dapdata.records import Array
 
 GROUP_ROWS = 1 << 17  # rows in a Parquet row group: what a writer holds in memory
+ROW_BYTES = 32  # that a row of either table takes at least: a digest
+MAX_COLUMNS, MAX_WORD, MAX_INFLATION = 100, 1000, 100  # more columns, longer words, larger columns are a bomb's
 
 
 class Writer:
@@ -105,10 +108,8 @@ class Index(Mapping[str, Array]):
         Raises:
             CorruptionError: if it is missing or no Parquet file.
         """
-        import pyarrow.parquet as pq
-
         with _explained(path):
-            about, self._stamp = pq.read_metadata(path), _stamp(path)
+            about, self._stamp = _measured(path), stamp(path)
             schema = about.schema.to_arrow_schema()
         self.path, self._chosen, self._all = path, chosen, about.num_rows
         self.numbers = tuple(field.name for field in schema if str(field.type) == "int64")  # columns of integers
@@ -142,7 +143,11 @@ class Index(Mapping[str, Array]):
     def codes(self, name: str) -> tuple[Array, list[str]]:
         """A column of words as (R,) codes and the words that they count, in the order in which the file has them."""
         column = self._column(name).unify_dictionaries().combine_chunks()
-        return self._of_mine(column.indices.to_numpy()), column.dictionary.to_pylist()
+        with _explained(self.path):
+            words = [str(word) for word in column.dictionary.to_pylist()]
+            if max(map(len, words), default=0) > MAX_WORD:
+                raise ValueError(f"column {name}: words of more than {MAX_WORD} characters")
+        return self._of_mine(column.indices.to_numpy()), words
 
     def stream(self, names: Sequence[str]) -> Iterator[tuple[Any, ...]]:
         """The rows of the file one after the other, with some of the columns; nothing is kept."""
@@ -157,10 +162,13 @@ class Index(Mapping[str, Array]):
         import pyarrow.parquet as pq
 
         with _explained(self.path):
-            if _stamp(self.path) != self._stamp:
+            if stamp(self.path) != self._stamp:
                 raise FormatError(f"{self.path}: written anew since it was opened, expected the same; open the dataset again")
             words = [] if name in self.numbers else [name]
-            return pq.read_table(self.path, columns=[name], read_dictionary=words).column(name)
+            column = pq.read_table(self.path, columns=[name], read_dictionary=words).column(name)
+            if len(column) != self._all or column.null_count:
+                raise ValueError(f"column {name}: {len(column) - column.null_count} values, expected {self._all}")
+            return column
 
     def _of_mine(self, column: Array) -> Array:
         return column if self._chosen is None else column[self._chosen]
@@ -185,9 +193,25 @@ def read(path: Path, name: str, value: str, columns: Sequence[str] | None = None
     import pyarrow.parquet as pq
 
     with _explained(path):
+        _measured(path)
         wanted = None if columns is None else list(columns)
         found: dict[str, list[Any]] = pq.read_table(path, columns=wanted, filters=[(name, "=", value)]).to_pydict()
         return found
+
+
+def _measured(path: Path) -> Any:
+    """A Parquet file's metadata; a ValueError if it says that there is more in the file than its bytes can hold."""
+    import pyarrow.parquet as pq
+
+    if not S_ISREG(path.lstat().st_mode):
+        raise ValueError("no plain file")
+    about, size = pq.read_metadata(path), path.stat().st_size
+    unpacked = sum(about.row_group(i).total_byte_size for i in range(about.num_row_groups))
+    if about.num_rows * ROW_BYTES > size or about.num_columns > MAX_COLUMNS or unpacked > MAX_INFLATION * size:
+        raise ValueError(
+            f"{about.num_rows} rows of {about.num_columns} columns in {size} bytes, expected rows of a digest each"
+        )
+    return about
 
 
 @contextmanager
@@ -197,13 +221,13 @@ def _explained(path: Path) -> Iterator[None]:
 
     try:
         yield
-    except CorruptionError:
+    except (CorruptionError, FormatError):
         raise
-    except (OSError, pa.ArrowException) as error:
+    except (OSError, ValueError, pa.ArrowException) as error:
         raise CorruptionError(f"{path}: cannot be read ({error}); run `dapdata verify {path.parent}`") from error
 
 
-def _stamp(path: Path) -> tuple[int, int, int]:
+def stamp(path: Path) -> tuple[int, int, int]:
     """What changes when a file is replaced."""
     about = os.stat(path)
     return about.st_ino, about.st_size, about.st_mtime_ns

@@ -95,9 +95,9 @@ def _make(work: Work, root: Path) -> dict[str, Any]:
         for need in stage.needs:
             if need not in made:
                 made[need] = _load(layout, stages[need], unit)
-        made[stage.name], rejects = _run_stage(stage, recipe, made, unit)
+        made[stage.name], rejects, rejected = _run_stage(stage, recipe, made, unit)
         ran, ran_cpu = time.perf_counter(), time.process_time()
-        size = _commit(layout, stages, stage, unit, made, rejects)
+        size = _commit(layout, stages, stage, unit, made, rejects, rejected)
         told.append(
             {
                 "stage": stage.name,
@@ -127,29 +127,35 @@ def _check_versions(work: Work, here: Mapping[str, Spec]) -> None:
 # Running a stage -------------------------------------------------------------------------------------------
 
 
-def _run_stage(stage: Stage, recipe: Any, made: Mapping[str, Made], unit: Unit) -> tuple[Made, dict[str, Counter[str]]]:
-    """The records of a unit's demos in one stage, and how many attempts and demos were rejected, by reason."""
+def _run_stage(
+    stage: Stage, recipe: Any, made: Mapping[str, Made], unit: Unit
+) -> tuple[Made, dict[str, Counter[str]], list[dict[str, Any]]]:
+    """The records of a unit's demos in one stage; how many attempts and demos were rejected, by reason; and which demos."""
     sections = {name: getattr(recipe, name) for name in stage.sections}
     rejects: dict[str, Counter[str]] = {"attempts": Counter(), "demos": Counter(), "goals": Counter()}
     records: Made = {}
+    rejected: list[dict[str, Any]] = []
     for demo in range(unit.start, unit.stop):
         if any(demo not in made[need] for need in stage.needs):
             continue
         inputs = {need: made[need][demo] for need in stage.needs}
         reasons: Counter[str] = Counter()
+        last = Rejected("")
         for attempt in range(stage.attempts):
             result = stage.run(inputs, sections, Draw(recipe.seed, demo, attempt))
             if not isinstance(result, Rejected):
                 records[demo] = _finished(result, recipe.seed, demo, attempt)
                 break
+            last = result
             reasons[result.reason] += 1
         if stage.attempts == 1:
             rejects["demos"] += reasons
+            rejected += [{"demo": demo, "reason": last.reason, "detail": last.detail}] if reasons else []
         elif demo not in records:
             raise UsageError(_no_demo(recipe, stage, demo, reasons))
         else:
             rejects["attempts"] += reasons
-    return records, rejects
+    return records, rejects, rejected
 
 
 def _finished(record: Record, seed: int, demo: int, attempt: int) -> Record:
@@ -195,6 +201,7 @@ def _commit(
     unit: Unit,
     made: Mapping[str, Made],
     rejects: dict[str, Counter[str]],
+    rejected: Sequence[dict[str, Any]],
 ) -> int:
     """Checks, writes and commits a unit; the bytes that were written for it."""
     parts = [stages[name] for name in layout.plan if stage.is_shard and name in stage.needs] + [stage]
@@ -211,6 +218,7 @@ def _commit(
         "key": layout.key(stage.name, unit),
         "demo_range": [unit.start, unit.stop],
         "rejects": {what: dict(sorted(counts.items())) for what, counts in rejects.items()},
+        **({"rejected": list(rejected)} if rejected else {}),
         "rows": [_row(demo, sample, stage.is_shard) for demo, sample in zip(demos, samples)],
     }
     lenders = list(_lenders(layout, stage, unit, demos)) if stage.is_shard else []
@@ -305,14 +313,13 @@ def publish(
             missing=list(missing),
             stages={},
             files={},
-            created_by={"dapdata": _version()} | store.created_by(),
+            created_by=created_by(),
         )
         shards = entries.get(layout.shard_stage, []) if index else []
         now = facts.model_copy(update={"shards": shards, "stages": _stage_entries(layout, entries)})
         tables = {manifest.UNITS: folder / manifest.UNITS} if large else {}
         tables |= {manifest.INDEX: index.path} if index else {}
         _write(layout.root, now, tables, _previews(layout.root, now))
-    durable.remove_file(layout.root / manifest.PROGRESS)
     return manifest.read(layout.root)
 
 
@@ -342,12 +349,12 @@ def _gather(
                 if stage.is_shard or not shard_is_there:
                     content.add(row["sha256"] for row in record["rows"])
                 if stage.is_shard:
-                    rows.add([_index_row(recipe, entry.path, number, row) for number, row in enumerate(record["rows"])])
+                    rows.add([index_row(recipe, entry.path, number, row) for number, row in enumerate(record["rows"])])
             entries.end_group()
     return content.hexdigest(), Rejects(**{what: dict(sorted(counts.items())) for what, counts in rejects.items()})
 
 
-def _index_row(recipe: Mapping[str, Any], shard: str, number: int, row: Mapping[str, Any]) -> dict[str, Any]:
+def index_row(recipe: Mapping[str, Any], shard: str, number: int, row: Mapping[str, Any]) -> dict[str, Any]:
     """A row of the index, but for the split."""
     names = [scene["task"] for scene in recipe["scene"].get("scenes", [recipe["scene"]])]
     place = {"shard": shard, "row": number, "task": names[row["task"]]}
@@ -391,6 +398,7 @@ def _write(root: Path, now: Manifest, tables: Mapping[str, Path], previews: Mapp
         folders = sorted({shard.path.rpartition("/")[0] for shard in now.shards})
         about[manifest.CROISSANT] = croissant.render(facts, folders, index)
     manifest.publish(root, now, {**tables, **previews, **about})
+    durable.remove_file(root / manifest.PROGRESS)
 
 
 def attach(root: Path, pictures: Mapping[str, bytes]) -> None:
@@ -415,8 +423,9 @@ def _stage_entries(layout: Layout, entries: Mapping[str, Sequence[UnitEntry]]) -
     return found
 
 
-def _version() -> str:
-    return str(import_module("dapdata").__version__)
+def created_by() -> dict[str, str]:
+    """The versions that write datasets here."""
+    return {"dapdata": str(import_module("dapdata").__version__)} | store.created_by()
 
 
 def _entry(layout: Layout, stage: Stage, unit: Unit) -> tuple[UnitEntry, dict[str, Any]]:

@@ -19,8 +19,8 @@ DAPTRAIN = sorted((ROOT / "train/daptrain").rglob("*.py"))
 # stage, in engines, which is one interface, in interop, and in tasks/mixed.py, which is made of the other tasks.
 LINES = (
     ("errors", "rng", "poses", "config"),
-    ("records", "strict_yaml", "durable", "clouds", "console"),
-    ("solids", "registration", "keys", "slic", "split", "matching", "tables", "buckets"),
+    ("records", "strict_yaml", "durable", "npz", "console"),
+    ("solids", "registration", "keys", "slic", "split", "matching", "tables", "buckets", "sense", "clouds"),
     ("meshes", "tabletop"),
     ("tasks",),
     ("simulate", "observe", "cluster", "labels"),
@@ -28,9 +28,9 @@ LINES = (
     ("croissant", "remote"),
     ("plan", "units", "slurm"),
     ("pipeline",),
-    ("loading", "draw", "schemas", "plots"),
-    ("metrics", "health", "pictures", "page"),
-    ("viewer", "live"),
+    ("loading", "draw", "schemas", "plots", "reproduce"),
+    ("metrics", "audit", "pictures", "page"),
+    ("viewer", "live", "health"),
     ("show", "bench", "doctor", "interop"),
     ("imports",),
     ("cli",),
@@ -46,7 +46,7 @@ MUST_NOT_KNOW = {
 }
 DAPTRAIN_MAY_KNOW = {
     "loading", "metrics", "records", "poses", "simulate", "errors", "rng", "config", "solids", "meshes", "report",
-    "predictions", "pictures", "draw", "page", "plots", "viewer", "matching", "clouds", "console",
+    "predictions", "pictures", "draw", "page", "plots", "viewer", "matching", "clouds", "console", "durable",
     "cluster",  # a user's own cloud must be partitioned as the training clouds were
 }  # fmt: skip
 DOORS = {

@@ -308,8 +308,8 @@ def test_evaluating_takes_overrides_of_what_acts_at_inference(tiny_dataset: Path
     pytest.importorskip("torch")
     run(capsys, "train", tiny_dataset, "--run", "r", "--steps", 1)
     options = ("--data", tiny_dataset, "--trials", 1, "-k", 1, "--draws", 2, "--split", "train", "--workers", 1)
-    found = printed(capsys, "eval", "r", *options, "--set", "train.refine=[]", "--set", "train.sample_steps=2", "--out", "o")
-    assert (found["method"]["settings"]["refine"], found["method"]["settings"]["sample_steps"]) == ([], 2)
+    found = printed(capsys, "eval", "r", *options, "--fast", "--set", "train.refine=[]", "--out", "o")
+    assert (found["method"]["settings"]["refine"], found["method"]["settings"]["sample_steps"]) == ([], 3)
     assert (found["method"]["k"], found["method"]["draws"]) == (1, 2)
     assert not Path("r/report.json").exists()
     assert predictions.read("o/predictions.npz").rank.tolist() == [0, 1]
@@ -324,6 +324,8 @@ def test_evaluating_takes_overrides_of_what_acts_at_inference(tiny_dataset: Path
         run(capsys, "eval", "r", *options, "--set", wrong, code=2)
         assert says in said()
         assert said().count("\n") == 1
+    run(capsys, "eval", "--data", tiny_dataset, "--fast", "--curve", "2", "--steps", 1, code=2)
+    assert said() == "--fast: is of one report; with --curve give --set train.sample_steps=3\n"
 
 
 def test_training_takes_overrides_of_its_own_section_only(tiny_dataset: Path, capsys: pytest.CaptureFixture[str]) -> None:

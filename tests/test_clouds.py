@@ -63,12 +63,12 @@ BROKEN = {
     "mesh.ply": (b"ply\nformat ascii 1.0\nelement face 1\nend_header\n", "first element is 'vertex'"),
     "bare.ply": (b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n", "has no y z nx ny nz"),
     "words.ply": (ply("ascii", b"a b c d e f\n" * 3), "words among its numbers"),
-    "nan.ply": (ply("ascii", text(ROWS * np.nan)), "NaN or infinite"),
+    "nan.ply": (ply("ascii", text(ROWS * np.nan)), "has NaN, infinite"),
     "none.ply": (ply("ascii", b"", 0), "has no points"),
     "flat.ply": (ply("ascii", text(ROWS * [1, 1, 1, 0, 0, 0])), "normals of length 0"),
     "packed.pcd": (f"{PCD}binary_compressed\n".encode(), "save it uncompressed"),
     "short.pcd": (b"FIELDS x y z\nDATA ascii\n1 2 3\n", "header without POINTS, SIZE, TYPE"),
-    "no.npz": (b"PK junk", "is no npz file"),
+    "no.npz": (b"PK junk", "cannot be read as npz"),
     "no.npy": (b"\x93NUMPY junk", "is no npy file"),
 }
 
@@ -121,12 +121,6 @@ def test_labels_that_are_not_whole_are_refused(tmp_path: Path) -> None:
     np.savez(tmp_path / "a.npz", points=POINTS, label=np.array([0, 0.5, 1]))
     with pytest.raises(FormatError, match="label: has numbers that are not whole"):
         read_points(tmp_path / "a.npz")
-
-
-def test_a_text_cloud_that_would_fill_the_memory_is_refused_by_its_header(tmp_path: Path) -> None:
-    (tmp_path / "a.ply").write_bytes(ply("ascii", text(ROWS), 4_000_000))
-    with pytest.raises(FormatError, match="4000000 points as text, expected 1666666 at the most; save it as binary"):
-        read_points(tmp_path / "a.ply")
 
 
 @pytest.mark.parametrize("far", [0.0, 1e7])

@@ -117,7 +117,7 @@ def test_every_link_leads_to_a_file(page: Path) -> None:
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: str(p.relative_to(ROOT)))
 def test_every_recipe_key_that_a_page_names_exists(page: Path) -> None:
-    schemas = [recipe.recipe_class(task).model_json_schema() for task in tasks.names()]
+    schemas = [recipe.recipe_class(task).model_json_schema() for task in (*tasks.names(), *recipe.IMPORTED)]
     known = {".".join(map(str, path)) for schema in schemas for path, _ in keys.walk(schema)}
     sections = set(recipe.Recipe.model_fields) - {"name", "seed", "demos", "shard_size"}
     for name in re.findall(r"`([a-z]+\.(?!glb|urdf|json)[a-z_]+)`", page.read_text(encoding="utf-8")):

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from forging import forge_manifest
 from toy_stages import toy_recipe
 
 import dapdata
@@ -143,13 +144,11 @@ def test_folders_that_are_no_dataset_are_refused(tmp_path: Path) -> None:
 
 
 def test_other_formats_say_who_made_them_and_what_to_do(toy_copy: Path) -> None:
-    path = toy_copy / "manifest.json"
-    tree = json.loads(path.read_text())
-    path.write_text(json.dumps(tree | {"format": 9}))
+    forge_manifest(toy_copy, lambda tree: tree.update(format=9))
     assert "update dapdata" in refused(toy_copy, FormatError)
-    path.write_text(json.dumps(tree | {"format": 0}))
+    forge_manifest(toy_copy, lambda tree: tree.update(format=0))
     assert f"made by dapdata {dapdata.__version__}" in refused(toy_copy, FormatError)
-    path.write_text(json.dumps(tree | {"format": "one"}))
+    forge_manifest(toy_copy, lambda tree: tree.update(format="one"))
     assert "no manifest of dapdata" in refused(toy_copy, FormatError)
 
 
@@ -161,9 +160,7 @@ def test_a_manifest_that_is_none_is_refused(toy_copy: Path, text: str) -> None:
 
 @pytest.mark.parametrize("path", ["../secret", "/etc/passwd", "a/../../b", ""])
 def test_paths_that_leave_the_dataset_are_refused(toy_copy: Path, path: str) -> None:
-    tree = json.loads((toy_copy / "manifest.json").read_text())
-    tree["shards"][0]["path"] = path
-    (toy_copy / "manifest.json").write_text(json.dumps(tree))
+    forge_manifest(toy_copy, lambda tree: tree["shards"][0].update(path=path))
     assert "shards.0.path" in refused(toy_copy, CorruptionError)
 
 

@@ -337,3 +337,22 @@ def test_a_mesh_is_drawn_like_the_solid() -> None:
         pictures.append(draw.image(canvas).astype(int))
     assert pictures[0].min() < 150
     assert (np.abs(pictures[0] - pictures[1]).max(axis=2) > 8).mean() < 0.005
+
+
+def test_pieces_are_found_in_files_that_keep_a_vertex_for_each_face_and_closed_ones_that_touch_stay_apart() -> None:
+    boxes = [mesh_scenes.box((0.1, 0.1, 0.1)), mesh_scenes.box((0.1, 0.1, 0.1), (0.1, 0, 0))]
+    assert [meshes.is_convex(piece) for piece in meshes.pieces(mesh_scenes.joined(*boxes))] == [True, True]
+    single = Mesh(boxes[0].vertices[boxes[0].faces].reshape(-1, 3), np.arange(36).reshape(-1, 3))
+    (piece,) = meshes.pieces(single)
+    assert meshes.is_convex(piece)
+    assert meshes.volume(piece) == pytest.approx(1e-3)
+    mixed = meshes.pieces(mesh_scenes.joined(single, boxes[1]))
+    assert sorted(len(piece.vertices) for piece in mixed) == [8, 8]
+
+
+def test_a_rod_has_a_long_axis_and_a_brick_has_none() -> None:
+    turned = rotation_about((1, 2, 3), 0.7)
+    rod = mesh_scenes.box((0.01, 0.012, 0.1))
+    axis = meshes.long_axis(Mesh(rod.vertices @ turned.T, rod.faces))
+    assert np.abs(axis @ turned[:, 2]) == pytest.approx(1)
+    assert meshes.long_axis(mesh_scenes.box((0.05, 0.04, 0.1))) is None

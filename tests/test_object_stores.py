@@ -9,6 +9,7 @@ import json
 import os
 import re
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -24,11 +25,12 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import make_toy
+from forging import forge_arrays
 from s3_server import Server
 from toy_stages import toy_recipe
 
 import dapdata
-from dapdata import buckets, cli, durable, health, manifest, pipeline, remote
+from dapdata import buckets, cli, durable, health, manifest, pipeline, remote, reproduce
 from dapdata.buckets import Conflict, Folder
 from dapdata.errors import CorruptionError, EnvironmentProblem, FormatError, LockedError, QuarantineError, UsageError
 
@@ -589,6 +591,21 @@ def test_damage_in_a_store_is_found_and_named(memory: Folder, small: Path) -> No
     }
     assert all(any(line.startswith(start) for line in report.problems) for start in expected), report.problems
     assert len(report.problems) == len(expected)
+
+
+def test_every_depth_of_verify_looks_into_a_store_as_into_a_folder(memory: Folder, small: Path, tmp_path: Path) -> None:
+    for depth in ({"quick": True}, {}, {"deep": True}):
+        assert health.verify(memory.url, **depth) == replace(health.verify(small, **depth), root=memory.url)
+    assert reproduce.reproduce(memory.url, 1, engine="inline", table=TABLE) == (1, [])
+    other = Path(shutil.copytree(small, tmp_path / "toy"))
+    unit = manifest.read(other).stages["observe"].units[0].path
+    forge_arrays(other, unit, lambda sample: sample.update({"container/normals": -sample["container/normals"]}))
+    memory.upload(other, [name for name in files_of(other) if name == "manifest.json" or name.startswith(unit)])
+    assert health.verify(memory.url).ok
+    (problem,) = {line.partition(": demo ")[2][3:] for line in health.verify(memory.url, deep=True).problems}
+    assert problem == "what stage observe made is not what its own unit holds"
+    _, problems = reproduce.reproduce(memory.url, 99, engine="inline", table=TABLE)
+    assert problems[0].startswith(f"{unit}: made anew, 1 of ")
 
 
 def test_a_reader_is_told_which_shard_is_damaged(memory: Folder, small: Path) -> None:

@@ -7,8 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import yaml
-from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from dapdata import keys, recipe, tasks
@@ -189,7 +187,7 @@ def test_every_shipped_recipe_loads(path: Path) -> None:
     assert recipe.load(path).scene.task in tasks.names()
 
 
-# One mutation of a valid recipe ----------------------------------------------------------------------------
+# One mutation of a valid recipe (for test_mistakes.py) -------------------------------------------------------
 
 
 def full_tree() -> Any:
@@ -228,26 +226,6 @@ def mutations(draw: st.DrawFn) -> tuple[str, keys.Location, Any]:
         return kind, draw(st.sampled_from(SECTIONS)), draw(st.sampled_from([3, "text", [1]]))
     path = draw(st.sampled_from(sorted(LEAVES)))
     return kind, path, draw(st.sampled_from(wrong_values(LEAVES[path])))
-
-
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(mutations())
-def test_one_wrong_thing_in_a_valid_recipe_is_found_with_its_key_and_line(
-    tmp_path: Path, mutation: tuple[str, keys.Location, Any]
-) -> None:
-    _, path, value = mutation
-    tree = full_tree()
-    place(tree, path)[path[-1]] = value
-    text = yaml.safe_dump(tree, sort_keys=False, default_flow_style=None, width=10_000)
-    before = sorted(tmp_path.iterdir())
-    lines = complaint(tmp_path, text)
-    named = ".".join(str(part) for part in path)
-    assert any(f": {named}" in line for line in lines), lines
-    (tmp_path / "x.yaml").unlink()
-    assert sorted(tmp_path.iterdir()) == before
-    for line in lines:
-        number = int(line.split(":")[1])
-        assert str(path[-1]) in text.split("\n")[number - 1]
 
 
 def test_a_preset_asked_of_a_dataset_takes_the_place_of_the_keys_it_sets() -> None:

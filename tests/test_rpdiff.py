@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import io
+import json
 import os
 import pickle
 import shutil
 import signal
 import subprocess
 import sys
+import tarfile
 import time
 import zipfile
 from base64 import b64decode
@@ -22,12 +25,13 @@ import rpdiff_demos
 from rpdiff_demos import book_demo, can_demo, changed, legacy, save, save_chunk
 from scipy.spatial import cKDTree
 
-from dapdata import cli, health, imports, loading, manifest, pictures, pipeline, poses, records, simulate, viewer
+from dapdata import cli, health, imports, loading, manifest, pictures, pipeline, poses, records, simulate, solids, tasks, viewer
 from dapdata.config import RpdiffConfig
 from dapdata.errors import FormatError, UsageError
-from dapdata.interop import object_arrays, rpdiff, rpdiff_clouds, rpdiff_files, rpdiff_scenes
+from dapdata.interop import object_arrays, rpdiff, rpdiff_clouds, rpdiff_files, rpdiff_scenes, scenes, webdataset
 from dapdata.observe import CamerasConfig
 from dapdata.records import Cloud, MeshDemo, Rejected, to_sample
+from dapdata.rng import stream
 from dapdata.simulate import PlacementConfig
 
 PLACEMENT, CAMERAS = PlacementConfig(), CamerasConfig()
@@ -396,6 +400,19 @@ def inwards(demo: dict[str, Any]) -> dict[str, Any]:
     return changed(demo, normals=toward, cam_poses=None, cam_intrinsics=None)
 
 
+def lifted(demo: dict[str, Any], height: float) -> dict[str, Any]:
+    """All of it, higher."""
+    up = np.array([0, 0, height])
+    clouds = {
+        key: {body: points + up for body, points in demo[key].items()} for key in ("multi_obj_start_pcd", "multi_obj_final_pcd")
+    }
+    bodies = {
+        key: {body: [[*pose[:2], pose[2] + height, *pose[3:]] for pose in poses] for body, poses in demo[key].items()}
+        for key in ("multi_obj_start_obj_pose", "multi_obj_final_obj_pose")
+    }
+    return changed(demo, **clouds, **bodies, cam_poses=demo["cam_poses"] + np.pad(up[:, None], ((0, 1), (3, 0))))
+
+
 MIRROR = np.diag([1.0, 1, -1, 1])
 FAULTS: dict[str, list[Any]] = {
     "missing_keys": [
@@ -418,6 +435,11 @@ FAULTS: dict[str, list[Any]] = {
         lambda d: changed(d, cam_poses=np.full((4, 4, 4), np.nan)),
     ],
     "not_metres": [lambda d: scaled(d, 1000), lambda d: scaled(d, 0.001)],
+    "not_on_table": [lambda d: lifted(d, -1.0), lambda d: lifted(d, 1.2)],
+    "too_large": [
+        lambda d: with_clouds(d, child=np.zeros((5_000_001, 3), np.uint8)),
+        lambda d: with_clouds(d, child=[np.zeros((100_000, 3), np.uint8)] * 51),
+    ],
     "not_rigid": [
         lambda d: with_pose(d, [0.3, 0, 1, 0, 0, 0, 0.0]),
         lambda d: with_pose(d, [0.3, 0, 1, 0, 0, 0, 2.0]),
@@ -426,7 +448,7 @@ FAULTS: dict[str, list[Any]] = {
     "clouds_and_poses_differ": [
         lambda d: changed(d, multi_obj_final_pcd={**d["multi_obj_final_pcd"], "child": d["multi_obj_start_pcd"]["child"]})
     ],
-    "normals_inwards": [inwards],
+    "normals_inwards": [inwards, lambda d: {**inwards(d), "cam_poses": d["cam_poses"], "cam_intrinsics": d["cam_intrinsics"]}],
     "no_normals": [lambda d: changed(d, cam_poses=None, cam_intrinsics=None)],
     "bad_arrays": [
         lambda d: changed(d, dapdata={"goals/T_world_object": np.zeros((1, 4, 4))}),
@@ -466,7 +488,7 @@ def test_a_cloud_that_would_fill_the_memory_is_not_read(book: dict[str, Any], tm
         np.lib.format.write_array_header_1_0(file, header)
         for _ in range(150):
             file.write(bytes(1 << 20))
-    assert both(path)[0] == Rejected("unreadable")
+    assert both(path)[0] == Rejected("too_large")
 
 
 def broken_meshes(folder: Path, reason: str) -> None:
@@ -483,11 +505,16 @@ def broken_meshes(folder: Path, reason: str) -> None:
         dec.write_text(rpdiff_demos.meshes.to_obj(shifted))
     if reason == "object_not_convex":
         dec.write_text(rpdiff_demos.meshes.to_obj([rpdiff_demos.mesh_scenes.cup()]))
+    if reason == "mesh_too_large":
+        shelf.write_text("v 0 0 0\nv 0 0 1\nv 0 1 0\n" + "f 1 2 3\n" * 200_001)
     if reason == "slots":
         (folder / "syn_bookshelf_obj/open_slot_poses/syn_bookshelf_0_open_slot_poses.txt").write_text("1 2 3\n")
 
 
-@pytest.mark.parametrize("case", ["mesh_missing", "mesh_broken", "mesh_and_cloud_differ", "object_not_convex", "slots"])
+BROKEN_MESHES = ("mesh_missing", "mesh_broken", "mesh_too_large", "mesh_and_cloud_differ", "object_not_convex")
+
+
+@pytest.mark.parametrize("case", [*BROKEN_MESHES, "slots"])
 def test_a_mesh_that_is_of_no_use_rejects_the_demo(case: str, book: dict[str, Any], mesh_folder: Path, tmp_path: Path) -> None:
     folder = Path(shutil.copytree(mesh_folder, tmp_path / "meshes"))
     broken_meshes(folder, case)
@@ -504,8 +531,7 @@ def test_a_demonstration_that_does_not_hold_is_rejected_for_what_became_of_it(me
 
 
 def test_every_reason_is_tested_and_documented() -> None:
-    meshes = {"mesh_missing", "mesh_broken", "mesh_and_cloud_differ", "object_not_convex"}
-    assert {*FAULTS, *meshes, "unreadable"} == rpdiff_files.REASONS.keys()
+    assert {*FAULTS, *BROKEN_MESHES, "unreadable", "refused", "outside"} == rpdiff_files.REASONS.keys()
     page = (Path(__file__).parents[1] / "docs/import_rpdiff.md").read_text()
     for reason, words in rpdiff_files.REASONS.items():
         assert f"| `{reason}` | {words} |" in page
@@ -678,6 +704,126 @@ def test_random_damage_is_an_error_that_is_known_or_harmless() -> None:
             data[at] = draw.integers(256)
         with suppress(*object_arrays.BROKEN):
             object_arrays.unpickle(bytes(data))
+
+
+# Links, several containers, and what is told of those that were left out
+
+
+def test_links_that_lead_out_are_rejected_and_links_to_folders_refused(book: dict[str, Any], tmp_path: Path) -> None:
+    save(tmp_path / "in/demo_aug_0.npz", book)
+    save(tmp_path / "elsewhere/demo_aug_1.npz", book)
+    (tmp_path / "in/demo_aug_1.npz").symlink_to(tmp_path / "elsewhere/demo_aug_1.npz")
+    (tmp_path / "in/demo_aug_2.npz").symlink_to("demo_aug_0.npz")
+    (tmp_path / "in/demo_aug_3.npz").symlink_to("nowhere.npz")
+    made = [both(tmp_path / "in", demo=demo)[0] for demo in range(4)]
+    assert isinstance(made[0], MeshDemo)
+    assert isinstance(made[2], MeshDemo), "a link within the source is a file of it"
+    assert made[1] == made[3] == Rejected("outside")
+    (tmp_path / "whole").symlink_to(tmp_path / "in")
+    assert len(rpdiff_files.find(str(tmp_path / "whole"))[0]) == 4, "the source itself may be a link"
+    (tmp_path / "in/more").symlink_to(tmp_path / "elsewhere")
+    rpdiff_files.find.cache_clear()
+    with pytest.raises(FormatError, match="in/more: a link to a folder, expected a folder; import what it leads to on its own"):
+        rpdiff_files.find(str(tmp_path / "in"))
+
+
+def test_a_mesh_behind_a_link_that_leads_out_is_not_read(book: dict[str, Any], mesh_folder: Path, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(mesh_folder, tmp_path / "meshes"))
+    shelf = folder / "syn_bookshelf_obj/syn_bookshelf_0.obj"
+    shutil.move(shelf, tmp_path / "shelf.obj")
+    shelf.symlink_to(tmp_path / "shelf.obj")
+    assert both(save(tmp_path / "a.npz", book), folder)[0] == Rejected("mesh_missing")
+
+
+def test_without_an_index_the_container_is_the_one_nearest_to_the_goal(book: dict[str, Any], tmp_path: Path) -> None:
+    (own,) = book["multi_obj_start_obj_pose"]["parent"]
+    far = [own[0], own[1] + 1.5, *own[2:]]
+    for index, parents in ((1, [far, own]), (0, [own, far])):
+        bodies = {key: {**book[key], "parent": parents} for key in ("multi_obj_start_obj_pose", "multi_obj_final_obj_pose")}
+        names = {key: {**book[key], "parent": ["a", "b"]} for key in ("multi_object_ids", "multi_obj_mesh_file")}
+        several = changed(book, **bodies, **names, placement_object_idx=None)
+        demo, _ = both(save(tmp_path / f"{index}.npz", several))
+        assert np.allclose(demo.T_world_container[:2, 3], own[:2])
+
+
+def test_each_demo_that_is_left_out_is_told_with_its_file_and_what_was_found(
+    book: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    save(tmp_path / "in/demo_aug_0.npz", scaled(book, 1000))
+    save_chunk(tmp_path / "in/demo_aug_1.npz", [book, {**book, "multi_obj_names": mark(tmp_path / "ran")}])
+    save(tmp_path / "in/demo_aug_2.npz", changed(book, multi_obj_final_obj_pose=None))
+    asked = ["import", "rpdiff", "in", "--out", "out", "--engine", "inline"]
+    code, out, err = run(capsys, *asked)
+    assert (code, out) == (0, "out\n")
+    *_, first, second, third, counts = err.splitlines()
+    assert first.startswith("rejected demo 0, not_metres: demo_aug_0.npz: container of ")
+    assert first.endswith("expected 0.05 to 5.0 m; in millimetres?")
+    assert second.startswith("rejected demo 2, refused: demo_aug_1.npz, demo 1: ")
+    assert "posix.system; it is refused, nothing was run" in second
+    assert third == "rejected demo 3, missing_keys: demo_aug_2.npz: no multi_obj_final_obj_pose"
+    assert counts == "imported 1 of 4 demos, 1 not_metres, 1 refused, 1 missing_keys; next: dapdata label out"
+    assert not (tmp_path / "ran").exists()
+    told = json.loads(run(capsys, *asked, "--json")[1])
+    assert [(one["demo"], one["reason"], one["stage"]) for one in told["rejected"]] == [
+        (0, "not_metres", "demonstrate"),
+        (2, "refused", "demonstrate"),
+        (3, "missing_keys", "demonstrate"),
+    ]
+    assert health.rejected("out") == told["rejected"]
+
+
+# Pegs and holes, and meshes of another size
+
+
+def hung() -> tuple[dict[str, Any], list[rpdiff_demos.Part], list[rpdiff_demos.Part]]:
+    """A mug on a rack: the demo, and the parts of both."""
+    task = tasks.load("mug_rack")
+    for seed in range(20):
+        scene = task.sample_scene(task.Params(), stream(seed, "scene", 0))
+        demo = scene if isinstance(scene, Rejected) else simulate.demonstrate(scene, PLACEMENT, stream(seed, "goal", 0))
+        if not isinstance(demo, Rejected):
+            break
+    solid = [solids.Part(int(k), tuple(s), T) for k, s, T in zip(demo.part_kind, demo.part_size, demo.T_container_part)]
+    mug = [solids.Part(int(k), tuple(s), T) for k, s, T in zip(demo.object_kind, demo.object_size, demo.T_object_part)]
+    T_goal = poses.inverse(demo.T_world_container) @ demo.T_world_object_goal
+    start = poses.pose(poses.rotation_about((1, 2, 3), 0.8), (0.3, -0.2, 1.2))
+    return rpdiff_demos.made("mug", "syn_rack_easy", solid, mug, start, T_goal, 0), solid, mug
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scale", [1.0, 0.3])
+def test_a_mug_hangs_on_its_peg_whatever_the_scale_of_the_meshes(scale: float, tmp_path: Path) -> None:
+    demo, rack, mug = hung()
+    for name, parts in (("syn_rack_easy_obj/syn_rack_easy_0.obj", rack), ("mug_obj/mug_0_dec.obj", mug)):
+        larger = [rpdiff_demos.meshes.scaled(mesh, 1 / scale) for mesh in rpdiff_demos.as_meshes(parts)]
+        rpdiff_demos.write(tmp_path / "meshes", name, larger)
+    made, _ = both(save(tmp_path / "a.npz", demo), tmp_path / "meshes")
+    assert isinstance(made, MeshDemo), made
+    assert [records.GOAL_KINDS[k] for k in made.goal_kind] == ["peg"]
+    peg = max(rack, key=lambda part: part.T[0, 3]).T[:3, 2]
+    assert abs(made.goal_approach[0] @ peg) > 0.999, "along the peg"
+    assert made.goal_approach[0, 2] > 0
+    sizes = np.sort(made.object_size, axis=1), np.sort([part.size for part in mug], axis=1)
+    assert sizes[0].max() == pytest.approx(sizes[1].max(), rel=0.01)
+    assert all(verdict.success for verdict in simulate.judge(made, made.goals, PLACEMENT))
+
+
+def test_what_goes_into_a_hole_comes_in_from_above(tmp_path: Path) -> None:
+    plate = solids.plate_with_holes(np.array([0.0, 0.08]), np.array([0.0]), 0.034, (0.03, 0.04), 0.03, 0.05)
+    base = [solids.box((0.174, 0.114, 0.005), (0.04, 0, 0.0025)), *plate]
+    vial = [solids.cylinder(0.0095, 0.12, (0, 0, 0))]
+    start = poses.pose(None, (0.3, -0.2, 1.06))
+    demo = rpdiff_demos.made("vial", "plate", base, vial, start, poses.pose(None, (0, 0, 0.075)), 0)
+    for name, parts in (("plate_obj/plate_0.obj", base), ("vial_obj/vial_0_dec.obj", vial)):
+        rpdiff_demos.write(tmp_path / "meshes", name, rpdiff_demos.as_meshes(parts))
+    made, _ = both(save(tmp_path / "a.npz", demo), tmp_path / "meshes", symmetry="revolution")
+    assert isinstance(made, MeshDemo), made
+    assert made.goal_approach.tolist() == [[0, 0, 1]]
+    assert made.opening.tolist() == [0, 0, 1]
+    assert all(verdict.success for verdict in simulate.judge(made, made.goals, PLACEMENT))
+    asked = both(tmp_path / "a.npz", tmp_path / "meshes", symmetry="revolution", opening="+x")[0]
+    assert asked == Rejected("outside"), "its middle is above the plate: from the front it is beside the container"
 
 
 # Commands
@@ -899,3 +1045,69 @@ def test_exporting_what_is_no_labelled_dataset_is_refused(tmp_path: Path, capsys
     assert code == 2
     assert "no such folder" in err
     assert not (tmp_path / "out").exists()
+
+
+# What every dataset can do
+
+
+def test_every_export_holds_the_meshes_or_says_why_not(imported: Path, samples: Samples, tmp_path: Path) -> None:
+    """The arrays go along, and scenes are the solids that the judge sees."""
+    import pybullet
+    import trimesh
+
+    webdataset.export(imported, tmp_path / "tars", shard_size=9)
+    with tarfile.open(next((tmp_path / "tars").glob("train-*.tar"))) as tar:
+        names = [name for name in tar.getnames() if name.endswith("mesh_faces.vertices.npy")]
+        faces = np.load(io.BytesIO(tar.extractfile(names[0]).read()))  # type: ignore[union-attr]
+    assert np.array_equal(faces, samples[int(names[0][5:11])]["mesh_faces/vertices"])
+    scenes.export(imported, tmp_path / "scenes")
+    for folder in (tmp_path / "scenes").glob("*/demo_*"):
+        sample = samples[int(folder.name[5:])]
+        found = trimesh.load(folder / "scene.glb")
+        T_world_part = sample["pose/T_world_container"] @ sample["scene/T_container_part"]
+        placed = [poses.transform(T, mesh.vertices) for T, mesh in zip(T_world_part, records.meshes_in(sample)[0]) if mesh]
+        name = found.graph["container"][1]
+        T_z_up_container = found.graph.get("container", "z_up")[0]
+        vertices = poses.transform(T_z_up_container, np.asarray(found.geometry[name].vertices))
+        assert np.allclose(np.sort(vertices, axis=0), np.sort(np.concatenate(placed), axis=0), atol=1e-6)
+        client = pybullet.connect(pybullet.DIRECT)
+        body = pybullet.loadURDF(str(folder / "object.urdf"), physicsClientId=client)
+        low, high = pybullet.getAABB(body, physicsClientId=client)
+        pybullet.disconnect(client)
+        extent = np.ptp(np.concatenate([mesh.vertices for mesh in records.meshes_in(sample)[1] if mesh]), axis=0)
+        assert np.array(high) - low == pytest.approx(extent, abs=0.006)
+
+
+def test_an_open_container_keeps_its_inside_in_a_urdf(tmp_path: Path) -> None:
+    import pybullet
+
+    cup = rpdiff_demos.mesh_scenes.cup()
+    size, T, mesh = rpdiff_demos.meshes.centred(cup)
+    parts = scenes.Parts(np.array([solids.MESH]), size[None], T[None], [mesh])
+    link = scenes._link(scenes.Frame("container", "", np.eye(4), parts, "container", collides=True), tmp_path)
+    (tmp_path / "a.urdf").write_bytes(scenes._robot("a", [link]))
+    client = pybullet.connect(pybullet.DIRECT)
+    pybullet.loadURDF(str(tmp_path / "a.urdf"), useFixedBase=True, physicsClientId=client)
+    (hit,) = pybullet.rayTest([0, 0, 0.5], [0, 0, -0.1], physicsClientId=client)
+    pybullet.disconnect(client)
+    assert hit[3][2] == pytest.approx(0.005, abs=1e-3), "the floor of the cup, not a lid"
+
+
+def test_a_card_of_imported_demos_names_their_source_and_claims_no_licence(imported: Path, source: Path) -> None:
+    text = (imported / manifest.CARD).read_text()
+    about = json.loads((imported / manifest.CROISSANT).read_bytes())
+    assert text.startswith("---\nlicense: other\n")
+    assert "\n- imported\n" in text
+    assert f"imported from `{source}`, where others made them, by dapdata" in text
+    assert "synthetic" not in text
+    assert "draws a scene" not in text
+    assert "| `mesh_faces/vertices` | i4 |" in text
+    assert "license" not in about
+    assert "imported" in about["keywords"]
+    assert {record["arrays/path"] for record in about["recordSet"][1]["data"]} >= {"mesh_faces/vertices", "goals/kind"}
+
+
+@pytest.mark.slow
+def test_the_description_of_imported_demos_is_valid_croissant(imported: Path) -> None:
+    mlc = pytest.importorskip("mlcroissant", reason="needs the extra dev")
+    assert mlc.Dataset(jsonld=str(imported / manifest.CROISSANT)).metadata.name == "demos"

@@ -13,9 +13,10 @@ import jsonschema
 import numpy as np
 import pytest
 from conftest import make_toy
+from forging import forge_manifest
 
 import dapdata
-from dapdata import health, loading, manifest, pipeline, recipe, store, tables
+from dapdata import audit, health, loading, manifest, pipeline, recipe, store, tables
 from dapdata.errors import CorruptionError, FormatError
 from dapdata.schemas import schema
 
@@ -130,10 +131,8 @@ def test_a_table_of_units_that_is_none_is_damage_and_never_a_traceback(large: Pa
 
 
 def test_shards_listed_otherwise_than_in_the_table_are_found(large: Path) -> None:
-    tree = tree_of(large)
-    tree["shards"][0]["path"] = "shards/other/00000.zarr"
-    (large / "manifest.json").write_text(json.dumps(tree))
-    assert any("shards: not the units of the last stage" in problem for problem in health.verify(large).problems)
+    forge_manifest(large, lambda tree: tree["shards"][0].update(path="shards/other/00000.zarr"))
+    assert "manifest.json: the shards are not the units of a stage" in health.verify(large).problems
 
 
 # The index -------------------------------------------------------------------------------------------------
@@ -248,7 +247,7 @@ def test_a_synthetic_dataset_opens_and_plans_like_a_true_one(scale: ModuleType, 
     assert len(manifest.read(root).shards) == count
     assert len(dapdata.open(root)) == 50_000
     assert health.inspect(root).to_dict()["demos_in_shards"] == 50_000
-    assert health._unnamed(root, manifest.read(root)) == []
+    assert audit.unnamed(root, manifest.read(root)) == []
     plan = pipeline.generate(recipe.from_resolved(manifest.read(root).recipe), root, dry_run=True)
     assert {stage.cached for stage in plan.stages} == {count}
     scale._lose_a_tenth(root, "observe")

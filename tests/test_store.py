@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 import warnings
 from pathlib import Path
 
@@ -14,7 +11,7 @@ import toy_stages
 import zarr
 
 from dapdata import durable, rng, store
-from dapdata.errors import CorruptionError, EnvironmentProblem, LockedError
+from dapdata.errors import CorruptionError, EnvironmentProblem
 from dapdata.records import Demo, to_sample
 
 
@@ -125,87 +122,6 @@ def test_superpoint_numbers_must_be_rows() -> None:
         "container_superpoints/size": np.array([1, 1, 1], np.int32),
     }
     assert any("container/superpoint" in problem for problem in store.problems(sample))
-
-
-# Durable ---------------------------------------------------------------------------------------------------
-
-
-class Crash(BaseException):
-    """A power cut: nothing catches it."""
-
-
-def stage_and_commit(root: Path) -> None:
-    with durable.staged(root, "unit") as folder:
-        (folder / "a").mkdir()
-        for name in ("a/1", "a/2", "zarr.json"):
-            (folder / name).write_text(name)
-        durable.commit(folder, root / "stages" / "unit")
-    durable.replace_file(root / "manifest.json", b"named")
-
-
-def test_fsync_of_files_then_folders_then_rename_then_fsync_of_the_parent(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    seen: list[tuple[str, str]] = []
-    monkeypatch.setattr(durable, "observer", lambda action, path: seen.append((action, path.name)))
-    stage_and_commit(tmp_path)
-    order = {pair: number for number, pair in enumerate(seen)}
-    assert (
-        order["fsync", "1"] < order["fsync", "a"] < order["fsync", "unit"] < order["rename", "unit"] < order["fsync", "stages"]
-    )
-    assert order["fsync", "stages"] < order["rename", "manifest.json"] < len(seen) - 1
-    assert seen[-1] == ("fsync", tmp_path.name)
-
-
-def test_a_crash_at_any_fsync_or_rename_leaves_the_unit_whole_or_absent(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    steps = 0
-
-    def count(action: str, path: Path) -> None:
-        nonlocal steps
-        steps += 1
-
-    monkeypatch.setattr(durable, "observer", count)
-    stage_and_commit(tmp_path / "counted")
-    for last in range(1, steps + 1):
-        root, done = tmp_path / str(last), 0
-
-        def stop(action: str, path: Path, last: int = last) -> None:
-            nonlocal done
-            done += 1
-            if done == last:
-                raise Crash
-
-        monkeypatch.setattr(durable, "observer", stop)
-        with pytest.raises(Crash):
-            stage_and_commit(root)
-        unit = root / "stages" / "unit"
-        assert not unit.exists() or sorted(p.name for p in unit.rglob("*")) == ["1", "2", "a", "zarr.json"]
-        assert not (root / "manifest.json").exists() or unit.exists()
-        monkeypatch.setattr(durable, "observer", None)
-        with durable.lock(root):
-            pass
-        assert not (root / durable.STAGING).exists()
-        assert not list(root.glob(".*.tmp"))
-
-
-def test_the_second_writer_is_told_who_the_first_is(tmp_path: Path) -> None:
-    with durable.lock(tmp_path), pytest.raises(LockedError, match=rf"process {os.getpid()} on "), durable.lock(tmp_path):
-        pass
-    with durable.lock(tmp_path):
-        pass
-
-
-def test_a_lock_dies_with_its_holder(tmp_path: Path) -> None:
-    code = (
-        "import os, pathlib, signal; from dapdata import durable\n"
-        f"with durable.lock(pathlib.Path({str(tmp_path)!r})): print('held', flush=True); os.kill(os.getpid(), signal.SIGKILL)"
-    )
-    died = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert died.stdout == "held\n"
-    with durable.lock(tmp_path):
-        pass
 
 
 def test_a_full_disk_says_what_is_needed(tmp_path: Path) -> None:

@@ -35,9 +35,16 @@ def poses(rng: np.random.Generator, count: int) -> np.ndarray:
     return T
 
 
-def unit(rng: np.random.Generator, count: int) -> np.ndarray:
-    vectors = rng.normal(size=(count, 3))
-    return (vectors / np.linalg.norm(vectors, axis=1, keepdims=True)).astype(np.float32)
+def within(rng: np.random.Generator, count: int, size: np.ndarray, T: np.ndarray) -> np.ndarray:
+    """(count, 3) points in some of P boxes (P, 3) at poses (P, 4, 4)."""
+    part = rng.integers(0, len(size), count)
+    return np.einsum("nij,nj->ni", T[part, :3, :3], (rng.random((count, 3)) - 0.5) * size[part]) + T[part, :3, 3]
+
+
+def towards(cameras: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """(N, 3) unit vectors from points to cameras."""
+    way = cameras - points
+    return (way / np.linalg.norm(way, axis=1, keepdims=True)).astype(np.float32)
 
 
 def called(name: str) -> None:
@@ -80,9 +87,10 @@ def demonstrate(made: Inputs, sections: Sections, draw: Draw) -> Demo | Rejected
         return Rejected("no_free_slot")
     rng = draw("demonstrate")
     goals, rejected, parts = int(rng.integers(1, 5)), int(rng.integers(0, 3)), int(rng.integers(2, 6))
-    T_goals = poses(rng, goals)
+    part_size, T_parts, T_container, T_goals = rng.random((parts, 3)), poses(rng, parts), poses(rng, 1)[0], poses(rng, goals)
+    T_goals[:, :3, 3] = within(rng, goals, part_size, T_container @ T_parts)
     return Demo(
-        T_world_container=poses(rng, 1)[0],
+        T_world_container=T_container,
         T_world_object_start=poses(rng, 1)[0],
         T_world_object_goal=T_goals[0],
         goals=T_goals,
@@ -94,8 +102,8 @@ def demonstrate(made: Inputs, sections: Sections, draw: Draw) -> Demo | Rejected
         symmetry_kind=np.array(2),
         symmetry_axis=np.array([0.0, 0.0, 1.0]),
         part_kind=np.zeros(parts),
-        part_size=rng.random((parts, 3)),
-        T_container_part=poses(rng, parts),
+        part_size=part_size,
+        T_container_part=T_parts,
         part_role=np.zeros(parts),
         opening=np.array([1.0, 0.0, 0.0]),
         max_tilt=np.array(0.2),
@@ -118,16 +126,20 @@ def observe(made: Inputs, sections: Sections, draw: Draw) -> Cloud | Rejected:
     if rng.random() < 0.1:
         return Rejected("empty_cloud")
     count, small = int(rng.integers(200, 400)), int(rng.integers(30, 60))
-    shift = {"none": 0.0, "d415": 0.1, "kinect": 0.2}[sections["noise"].preset]
+    shift = {"none": 0.0, "d415": 0.01, "kinect": 0.02}[sections["noise"].preset]
+    demo: Demo = made["demonstrate"]
+    cameras, view, other_view = poses(rng, 7), rng.integers(0, 3, count), rng.integers(0, 4, small)
+    points = within(rng, count, demo.part_size, demo.T_world_container @ demo.T_container_part) + shift
+    object_points = within(rng, small, demo.object_size, demo.T_world_object_start @ demo.T_object_part) + shift
     return Cloud(
-        container_points=rng.normal(size=(count, 3)) + shift,
-        container_normals=unit(rng, count),
-        container_view=rng.integers(0, 3, count),
-        object_points=rng.normal(size=(small, 3)) + shift,
-        object_normals=unit(rng, small),
-        object_view=rng.integers(0, 4, small),
+        container_points=points,
+        container_normals=towards(cameras[view, :3, 3], points),
+        container_view=view,
+        object_points=object_points,
+        object_normals=towards(cameras[3 + other_view, :3, 3], object_points),
+        object_view=other_view,
         camera_K=np.tile(np.eye(3), (7, 1, 1)),
-        T_world_camera=poses(rng, 7),
+        T_world_camera=cameras,
     )
 
 

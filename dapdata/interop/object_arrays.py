@@ -44,6 +44,14 @@ NAMES = {
 BROKEN = (ValueError, IndexError, KeyError, TypeError, OverflowError, MemoryError, EOFError, struct.error, AttributeError)
 
 
+class RefusedError(FormatError):
+    """A pickle that holds more than plain data."""
+
+
+class TooLargeError(FormatError):
+    """An array that would take more memory than any of its kind needs."""
+
+
 def member_names(path: Path) -> dict[str, tuple[int, int]]:
     """{name of each array: (bytes unpacked, checksum)} of an npz file, without reading its arrays.
 
@@ -62,12 +70,14 @@ def read(path: Path, name: str) -> Any:
     """An array of an npz file: an array of numbers or text, or of an object array the object or the list of objects in it.
 
     Raises:
-        FormatError: no such array, one that is too large, damaged, or that holds anything but plain data.
+        FormatError: no such array, or a damaged one. Its children: TooLargeError; RefusedError, anything but plain data.
     """
     with _problems(path, name), zipfile.ZipFile(path) as archive:
         info = archive.getinfo(f"{name}.npy")
         if info.file_size > MAX_BYTES:
-            raise FormatError(f"{path}: {name}: {info.file_size} bytes, expected {MAX_BYTES} at the most; split it")
+            raise TooLargeError(
+                f"{path}: {name}: {info.file_size} bytes, expected {MAX_BYTES} at the most; thin the clouds out"
+            )
         return _from_npy(archive.read(info))
 
 
@@ -81,7 +91,8 @@ def _problems(path: Path, name: str = "") -> Iterator[None]:
     except (*BROKEN, zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, OSError) as error:
         where = f"{path}: {name}" if name else str(path)
         what = str(error) if isinstance(error, (ValueError, zipfile.BadZipFile)) else type(error).__name__
-        raise FormatError(f"{where}: cannot be read ({what}), expected an npz file of plain arrays") from error
+        kind = RefusedError if isinstance(error, _NotDataError) else FormatError
+        raise kind(f"{where}: cannot be read ({what}), expected an npz file of plain arrays") from error
 
 
 def _from_npy(data: bytes) -> Any:
@@ -108,6 +119,10 @@ def _dtype(text: str) -> np.dtype[Any]:
 
 
 # The opcodes -----------------------------------------------------------------------------------------------
+
+
+class _NotDataError(ValueError):
+    """What a pickle asks for beyond plain data."""
 
 
 class _Name:
@@ -155,7 +170,7 @@ class _Machine:
     def name(self, module: str, name: str) -> None:
         known = NAMES.get((module, name)) if isinstance(module, str) and isinstance(name, str) else None
         if known is None:
-            raise ValueError(f"a pickle that asks for {str(module)[:40]}.{str(name)[:40]}; it is refused, nothing was run")
+            raise _NotDataError(f"a pickle that asks for {str(module)[:40]}.{str(name)[:40]}; it is refused, nothing was run")
         self.stack.append(_Name(known))
 
     def reduce(self) -> None:
@@ -169,13 +184,13 @@ class _Machine:
         elif known == "scalar" and len(arguments) == 2:
             self.stack.append(_array((), _finished(arguments[0]), False, arguments[1])[()])
         else:
-            raise ValueError("a pickle that makes something other than arrays; it is refused, nothing was run")
+            raise _NotDataError("a pickle that makes something other than arrays; it is refused, nothing was run")
 
     def build(self) -> None:
         """The state of an array or a dtype."""
         made, state = self.take(2)
         if not isinstance(made, _Unfinished):
-            raise ValueError("a pickle that sets the state of something other than an array; it is refused, nothing was run")
+            raise _NotDataError("a pickle that sets the state of something other than an array; it is refused, nothing was run")
         if made.dtype is not None:
             version, order, *rest = state
             if version != 3 or order not in ("<", ">", "|", "=") or any(part is not None for part in rest[:3]):
@@ -277,7 +292,7 @@ def unpickle(data: bytes) -> Any:
             raise ValueError(f"a pickle of more than {MAX_OPCODES} steps")
         step = OPCODES.get(opcode.name)
         if step is None:
-            raise ValueError(f"a pickle with the step {opcode.name}; it is refused, nothing was run")
+            raise _NotDataError(f"a pickle with the step {opcode.name}; it is refused, nothing was run")
         step(machine, argument)
     (value,) = machine.stack
     if isinstance(value, (_Unfinished, _Name)):

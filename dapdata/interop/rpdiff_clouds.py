@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from dapdata.config import RpdiffConfig
 from dapdata.interop.normals import by_camera, estimated_normals, project
-from dapdata.interop.rpdiff_files import Bodies, Fault, Raw, check, on_table, own, read_fields
+from dapdata.interop.rpdiff_files import Bodies, Fault, Raw, check, on_table, own, read_fields, rejected
 from dapdata.observe import CamerasConfig
 from dapdata.records import Cloud, Demo, Rejected
 
@@ -31,25 +31,24 @@ MAX_IMAGE = 4096  # px
 
 def observe(config: RpdiffConfig, cameras: CamerasConfig, demo: Demo) -> Cloud | Rejected:
     """The clouds of a demo of the source, fused as our own; of the cameras only voxels and least numbers are used."""
+    number = int(demo.demo)
     try:
-        found = read_fields(config, int(demo.demo))
+        found = read_fields(config, number)
         if "dapdata" in found:
             cloud_as_exported: Cloud = own(found["dapdata"], Cloud)
             return cloud_as_exported
-        raw = check(found)
+        raw = check(found, config.table_height)
         normals = raw.normals or Bodies(None, None)
         container = _fused(raw.points.parent, normals.parent, raw, config, cameras.container_voxel)
         object_ = _fused(raw.points.child, normals.child, raw, config, cameras.object_voxel)
+        for points, least, body in (
+            (container[0], cameras.min_container_points, "container"),
+            (object_[0], cameras.min_object_points, "object"),
+        ):
+            if len(points) < least:
+                raise Fault(f"too_few_{body}_points", f"{len(points)} when fused, expected {least}")
     except Fault as fault:
-        return Rejected(str(fault))
-    for points, least, body in (
-        (container[0], cameras.min_container_points, "container"),
-        (object_[0], cameras.min_object_points, "object"),
-    ):
-        if len(points) < least:
-            return Rejected(f"too_few_{body}_points")
-    if raw.normals is not None and np.einsum("ij,ij->", object_[1], object_[0] - object_[0].mean(axis=0)) < 0:
-        return Rejected("normals_inwards")
+        return rejected(config, number, fault)
     T_world_camera = np.array([on_table(T, config) for T in raw.T_world_camera]).reshape(-1, 4, 4)
     return Cloud(
         **{f"container_{name}": array for name, array in zip(("points", "normals", "view"), container)},
@@ -57,6 +56,12 @@ def observe(config: RpdiffConfig, cameras: CamerasConfig, demo: Demo) -> Cloud |
         camera_K=np.concatenate([raw.K, raw.K]),
         T_world_camera=np.concatenate([T_world_camera, T_world_camera]),
     )
+
+
+def at_pixel_centres(points: Array, raw: Raw, config: RpdiffConfig) -> Array:
+    """(N, 3) the points of one body's cloud where `observe` has them before fusing, in the source's world."""
+    views = _depth_views(points, raw, config)
+    return points if views is None else np.concatenate([found for found, _ in views])
 
 
 def _fused(points: Array, normals: Array | None, raw: Raw, config: RpdiffConfig, voxel: float) -> tuple[Array, Array, Array]:
@@ -107,7 +112,7 @@ def _by_camera(points: Array, normals: Array | None, raw: Raw) -> list[tuple[Arr
     if normals is not None:
         length = np.linalg.norm(normals, axis=1, keepdims=True)
         if not (length > 0).all():
-            raise Fault("not_finite")
+            raise Fault("not_finite", "normals of no length")
         normals = normals / length
     if not len(raw.K):
         if normals is None:

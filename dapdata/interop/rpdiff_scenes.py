@@ -7,7 +7,7 @@ placement, and what it comes to is the demonstrated goal, if that stands up to w
 slots of the container, where a file names them. Without meshes there is one goal, of the kind "commanded".
 
 Considered and not taken: primitives fitted to the pieces of a mesh (a convex hull is as exact to the simulator), and
-fitting the object's scale (it is not stored, within 0.5 %).
+fitting the scale of books and cans (it is not stored, within 0.5 %); only meshes off which the cloud is are fitted.
 """
 
 from __future__ import annotations
@@ -26,7 +26,19 @@ from dapdata import meshes, solids, store
 from dapdata.config import RpdiffConfig
 from dapdata.errors import FormatError
 from dapdata.interop import object_arrays
-from dapdata.interop.rpdiff_files import SLOT_SUFFIXES, Fault, Raw, check, mesh_folder, on_table, own, poses_of, read_fields
+from dapdata.interop.rpdiff_clouds import at_pixel_centres
+from dapdata.interop.rpdiff_files import (
+    SLOT_SUFFIXES,
+    Fault,
+    Raw,
+    check,
+    mesh_folder,
+    on_table,
+    own,
+    poses_of,
+    read_fields,
+    rejected,
+)
 from dapdata.poses import inverse, pose, rotation_about, symmetric_distance, transform, upright_turn
 from dapdata.records import (
     GOAL_KINDS,
@@ -40,10 +52,11 @@ from dapdata.records import (
     meshes_of,
     pack_meshes,
 )
-from dapdata.simulate import PlacementConfig, drop, free_play, record, settle
+from dapdata.simulate import HANG_SHIFT, PlacementConfig, drop, free_play, record, settle, ways_out
 
 Array = NDArray[Any]
 
+SCALES, OFF_SCALED = (0.05, 20.0), 0.005  # of meshes that are tried, and m that nine points of ten are off at most
 MAX_SLOTS, MAX_SLOT_BYTES = 200, 1_000_000  # of a container; RPDiff's have 22 and a few kB at most
 OFF_MESH, CHECKED_POINTS = 0.01, 500  # m; RPDiff's clouds are 0.1 to 0.8 mm off in the median
 ABOVE = 0.01  # m: a slot's pose is let go from this far above, as in RPDiff
@@ -52,7 +65,8 @@ SAME_GOAL = 0.015  # m and
 SAME_TURN = np.radians(10)  # rad: closer poses are one goal; slots are at least a can's or a book's width apart
 MAX_TILT_DEG = 15.0  # RPDiff's own limit, of cans
 FULL = 0.95  # share of the cuboid or cylinder around it that an object of that symmetry fills at least
-BOX_NAMES, ROUND_NAMES = ("book", "box"), ("can",)  # words of RPDiff's classes
+BOX_NAMES, ROUND_NAMES, PEG_NAMES = ("book", "box"), ("can",), ("rack", "hook", "hanger")  # words of classes
+UP = np.array([0.0, 0.0, 1.0])
 
 
 def demonstrate(config: RpdiffConfig, placement: PlacementConfig, demo: int) -> MeshDemo | Rejected:
@@ -62,10 +76,10 @@ def demonstrate(config: RpdiffConfig, placement: PlacementConfig, demo: int) -> 
         if "dapdata" in found:
             demo_as_exported: MeshDemo = own(found["dapdata"], MeshDemo)
             return demo_as_exported
-        raw = check(found)
+        raw = check(found, config.table_height)
         return _settled(raw, config, placement) if config.meshes else _commanded(raw, config)
     except Fault as fault:
-        return Rejected(str(fault))
+        return rejected(config, demo, fault)
 
 
 def _commanded(raw: Raw, config: RpdiffConfig) -> MeshDemo:
@@ -78,61 +92,61 @@ def _commanded(raw: Raw, config: RpdiffConfig) -> MeshDemo:
         object_instance=_named_instance(raw.names.child[0]),
     )
     goal = inverse(scene.T_world_container) @ on_table(raw.T_world_final, config) @ T_theirs_object
-    scene = replace(
-        scene,
-        T_container_goal=goal[None],
-        goal_kind=_kinds(1, "commanded"),
-        goal_clearance=_open(1),
-        goal_approach=scene.opening[None],
-    )
-    made = record(scene, goal[None], [0], [], [], 0)
+    made = record(_with_candidates(scene, goal[None], "commanded"), goal[None], [0], [], [], 0)
     assert isinstance(made, MeshDemo)
     return made
 
 
-def _settled(raw: Raw, config: RpdiffConfig, placement: PlacementConfig) -> MeshDemo | Rejected:
+def _settled(raw: Raw, config: RpdiffConfig, placement: PlacementConfig) -> MeshDemo:
     """The demo with container and object as meshes, and with every goal that holds: the demonstrated one, and free slots."""
     parents, object_ = _meshes(raw, config)
+    instances = solids.digest(*parents[raw.parent]), solids.digest(*(array for mesh in object_ for array in mesh))
+    scale, parents = _at_scale(parents, raw.T_world_parents, raw.points.parent, raw, config)
+    _, object_ = _at_scale(object_, np.tile(raw.T_world_start, (len(object_), 1, 1)), raw.points.child, raw, config)
     corners = np.concatenate([mesh.vertices for mesh in object_])
     low, high = corners.min(axis=0), corners.max(axis=0)
     T_theirs_object = _upright_frame(raw, (low + high) / 2)
     symmetry = _symmetry(object_, raw, config, T_theirs_object)
     scene = _scene(raw, config, T_theirs_object, parents, object_, symmetry)
-    _check_meshes(raw, scene, config)
-    scene = replace(
-        scene,
-        container_instance=solids.digest(*parents[raw.parent]),
-        object_instance=solids.digest(*(array for mesh in object_ for array in mesh)),
-    )
+    scene = replace(scene, container_instance=instances[0], object_instance=instances[1])
     T_container_world = inverse(scene.T_world_container)
     commanded = T_container_world @ on_table(raw.T_world_final, config) @ T_theirs_object
     T_container_parent = T_container_world @ on_table(raw.T_world_parents[raw.parent], config)
     height = float(abs(T_theirs_object[:3, 2]) @ (high - low))
-    slots = [T_container_parent @ T for T in _slots(raw, config, T_theirs_object, height)]
-    return _with_goals(scene, _distinct([commanded, *slots], 1e-4, 1e-3, scene), config, placement)
+    slots = [T_container_parent @ pose(T[:3, :3], scale * T[:3, 3]) for T in _slots(raw, config, T_theirs_object, height)]
+    hangs = config.hanging == "yes" or (config.hanging == "auto" and _is_called(raw.classes.parent, PEG_NAMES))
+    return _with_goals(scene, _distinct([commanded, *slots], 1e-4, 1e-3, scene), hangs, config, placement)
 
 
-def _with_goals(scene: MeshScene, proposed: Array, config: RpdiffConfig, placement: PlacementConfig) -> MeshDemo | Rejected:
-    """The demo of proposed poses (G, 4, 4), container frame, let go and checked; rejected if the first does not hold."""
+def _with_goals(scene: MeshScene, proposed: Array, hangs: bool, config: RpdiffConfig, placement: PlacementConfig) -> MeshDemo:
+    """The demo of proposed poses (G, 4, 4), container frame, let go and checked.
+
+    Raises:
+        Fault: the first does not hold.
+    """
+    scene = _with_candidates(scene, proposed, "peg" if hangs else "settled")
     dropped = drop(scene, proposed, placement, config.drop_seconds)
     symmetry = SYMMETRIES[scene.symmetry_kind], scene.symmetry_axis
     came = [symmetric_distance(T, T_from, *symmetry) for T, T_from in zip(dropped, proposed)]
-    stayed = [g for g, (shift, turn) in enumerate(came) if shift <= MAX_DROP and turn <= np.radians(placement.max_turn_deg)]
+    most = (HANG_SHIFT, np.pi) if hangs else (MAX_DROP, np.radians(placement.max_turn_deg))
+    stayed = [g for g, (shift, turn) in enumerate(came) if shift <= most[0] and turn <= most[1]]
     if 0 not in stayed:
-        return Rejected("moved")
+        shift, turn = came[0]
+        raise Fault("moved", f"the demonstrated goal, by {1000 * shift:.0f} mm and {np.degrees(turn):.0f} degrees when let go")
     chosen = _distinct(dropped[stayed], SAME_GOAL, SAME_TURN, scene)
-    settled, reasons = settle(scene, chosen, placement)
+    ways = ways_out(scene, chosen, _ways(scene, chosen, hangs), placement)
+    if config.opening == "auto" and np.array_equal(ways[0], UP) and not hangs:
+        scene = replace(scene, opening=UP)
+    settled, reasons = settle(scene, chosen, placement, ways)
     if reasons[0] != "ok":
-        return Rejected(reasons[0])
+        raise Fault(reasons[0], "the demonstrated goal, as it came to rest")
     lost = [g for g in range(len(proposed)) if g not in stayed]
     everything = np.concatenate([chosen, proposed[lost]])
     reasons += ["moved"] * len(lost)
     scene = replace(
-        scene,
-        T_container_goal=everything,
-        goal_kind=_kinds(len(everything), "settled"),
+        _with_candidates(scene, everything, "peg" if hangs else "settled"),
         goal_clearance=np.concatenate([free_play(scene, settled, placement), _open(len(lost))]),
-        goal_approach=np.tile(scene.opening, (len(everything), 1)),
+        goal_approach=np.concatenate([ways, np.tile(scene.opening, (len(lost), 1))]),
     )
     kept = [g for g, reason in enumerate(reasons) if reason == "ok"]
     codes = {g: REJECT_REASONS.index(reason) for g, reason in enumerate(reasons) if reason != "ok"}
@@ -141,16 +155,67 @@ def _with_goals(scene: MeshScene, proposed: Array, config: RpdiffConfig, placeme
     return made
 
 
-def _check_meshes(raw: Raw, scene: MeshScene, config: RpdiffConfig) -> None:
-    """Whether the clouds lie on the meshes: a mesh of the same name may be another one, or in other units."""
-    down = np.array([0, 0, config.table_height])
-    found, T_world = meshes_of(scene), (scene.T_world_container, scene.T_world_object_start)
-    parts = (scene.T_container_part, scene.T_object_part)
-    for cloud, T, T_body_part, pieces in zip((raw.points.parent, raw.points.child), T_world, parts, found):
-        few = cloud[:: max(1, len(cloud) // CHECKED_POINTS)] - down
-        placed = [_moved(mesh, T @ part) for part, mesh in zip(T_body_part, pieces) if mesh is not None]
-        if np.median(meshes.distances(placed, few)) > OFF_MESH:
-            raise Fault("mesh_and_cloud_differ")
+def _with_candidates(scene: MeshScene, poses: Array, kind: str) -> MeshScene:
+    """The scene with candidates (G, 4, 4), container frame, of one kind, that come in through the opening."""
+    count = len(poses)
+    approach = np.tile(scene.opening, (count, 1))
+    return replace(
+        scene, T_container_goal=poses, goal_kind=_kinds(count, kind), goal_clearance=_open(count), goal_approach=approach
+    )
+
+
+def _ways(scene: MeshScene, poses: Array, hangs: bool) -> Array:
+    """(G, W, 3) ways out that are tried in turn: of what hangs first along rods, the nearest first, then opening and up."""
+    general = np.stack([scene.opening, UP])
+    rods = [_rod(mesh, T) for mesh, T in zip(meshes_of(scene)[0], scene.T_container_part) if mesh is not None and hangs]
+    found = []
+    for T in poses:
+        near = sorted((rod for rod in rods if rod is not None), key=lambda rod: float(np.linalg.norm(rod[1] - T[:3, 3])))
+        found.append([*(way for way, _ in near), *(-way for way, _ in near), *general])
+    return np.array(found)
+
+
+def _rod(mesh: Mesh, T_container_part: Array) -> tuple[Array, Array] | None:
+    """The way along a piece of the container that is a rod, upwards, and its upper end, container frame; None of others."""
+    axis = meshes.long_axis(mesh)
+    if axis is None:
+        return None
+    way = T_container_part[:3, :3] @ axis
+    way = way if way[2] >= 0 else -way
+    placed = transform(T_container_part, mesh.vertices)
+    return way, placed[np.argmax(placed @ way)]
+
+
+def _at_scale(found: Sequence[Mesh], T_world: Array, cloud: Array, raw: Raw, config: RpdiffConfig) -> tuple[float, list[Mesh]]:
+    """The scale at which a cloud (N, 3) lies on meshes that are placed at (M, 4, 4) poses, and the meshes at that scale.
+
+    It is 1 where that will do. RPDiff's racks and mugs are drawn at 0.25 to 0.35 of their meshes and do not say so.
+
+    Raises:
+        Fault: there is none: a mesh of the same name may be another one.
+    """
+    from scipy.optimize import minimize_scalar
+
+    def off(scale: float) -> Array:
+        few = cloud[:: max(1, len(cloud) // CHECKED_POINTS)]
+        return meshes.distances([_moved(meshes.scaled(mesh, scale), T) for mesh, T in zip(found, T_world)], few)
+
+    def mean(scale: float) -> float:
+        return float(off(scale).mean())
+
+    as_is = float(np.median(off(1.0)))
+    if as_is <= OFF_MESH:
+        return 1.0, list(found)
+    cloud = at_pixel_centres(cloud, raw, config)
+    coarse = np.geomspace(*SCALES, 100)
+    nearest = int(np.argmin([mean(scale) for scale in coarse]))
+    bounds = coarse[max(nearest - 1, 0)], coarse[min(nearest + 1, len(coarse) - 1)]
+    fitted = minimize_scalar(mean, bounds=bounds, method="bounded", options={"xatol": 1e-4 * bounds[0]})
+    if np.quantile(off(fitted.x), 0.9) > OFF_SCALED:
+        raise Fault(
+            "mesh_and_cloud_differ", f"by {1000 * as_is:.0f} mm in the median, and at every scale; expected the same body"
+        )
+    return float(fitted.x), [meshes.scaled(mesh, float(fitted.x)) for mesh in found]
 
 
 def _scene(
@@ -167,7 +232,7 @@ def _scene(
     placed = [_moved(piece, T) for mesh, T in zip(parents, T_container_parents) for piece in meshes.pieces(mesh)]
     parts = [meshes.centred(piece) for piece in placed]
     object_parts = [meshes.centred(_moved(piece, inverse(T_theirs_object)), by_mass=True) for piece in object_]
-    sign, name = config.opening
+    sign, name = "+x" if config.opening == "auto" else config.opening
     opening = np.eye(3)["xyz".index(name)] * (1 if sign == "+" else -1)
     kind, axis = symmetry
     tilt = config.max_tilt_deg if config.max_tilt_deg is not None else MAX_TILT_DEG if kind != "none" else 180.0
@@ -224,10 +289,14 @@ def _upright_frame(raw: Raw, middle: Array) -> Array:
     return pose(upright_turn(raw.T_world_final[:3, :3]), middle)
 
 
+def _is_called(name: str, words: Sequence[str]) -> bool:
+    return bool({*name.lower().split("_")} & {*words})
+
+
 def _named_symmetry(raw: Raw, config: RpdiffConfig, T_theirs_object: Array) -> tuple[str, Array]:
     """The symmetry as asked for, or as the object's class suggests; and the axis of a revolution, z in its file."""
-    words = raw.child_class.lower().split("_")
-    by_name = "box" if {*words} & {*BOX_NAMES} else "revolution" if {*words} & {*ROUND_NAMES} else "none"
+    by_name = "box" if _is_called(raw.classes.child, BOX_NAMES) else "none"
+    by_name = "revolution" if _is_called(raw.classes.child, ROUND_NAMES) else by_name
     return by_name if config.symmetry == "auto" else config.symmetry, np.abs(T_theirs_object[2, :3])
 
 
@@ -263,22 +332,22 @@ def _meshes(raw: Raw, config: RpdiffConfig) -> tuple[list[Mesh], list[Mesh]]:
     """The meshes of the containers, and the convex pieces of the object, each in its file's frame."""
     assert config.meshes is not None
     folder = mesh_folder(config.meshes)
-    parents = [_read_mesh(folder.path(named)) for named in raw.mesh_files.parent]
-    path = (folder.path(raw.convex_file) if raw.convex_file else None) or folder.path(raw.mesh_files.child[0])
-    object_ = meshes.convex_pieces(_read_mesh(path))
+    parents = [_read_mesh(folder.path(named), named) for named in raw.mesh_files.parent]
+    named = raw.convex_file if raw.convex_file and folder.path(raw.convex_file) else raw.mesh_files.child[0]
+    object_ = meshes.convex_pieces(_read_mesh(folder.path(named), named))
     if object_ is None:
-        raise Fault("object_not_convex")
+        raise Fault("object_not_convex", named)
     return parents, object_
 
 
 @lru_cache(maxsize=64)
-def _read_mesh(path: Path | None) -> Mesh:
+def _read_mesh(path: Path | None, named: str) -> Mesh:
     if path is None:
-        raise Fault("mesh_missing")
+        raise Fault("mesh_missing", named or "the file names none")
     try:
         return meshes.read_mesh(path)
     except FormatError as error:
-        raise Fault("mesh_broken") from error
+        raise Fault("mesh_too_large" if isinstance(error, meshes.TooLargeError) else "mesh_broken", str(error)) from error
 
 
 def _slots(raw: Raw, config: RpdiffConfig, T_theirs_object: Array, height: float) -> list[Array]:
@@ -297,7 +366,7 @@ def _slots(raw: Raw, config: RpdiffConfig, T_theirs_object: Array, height: float
                     raise ValueError("a slot file of that size")
                 return reader(path, T_theirs_object, height)
             except (Fault, FormatError, OSError, ValueError, KeyError, TypeError) as error:
-                raise Fault("mesh_broken") from error
+                raise Fault("mesh_broken", f"{path.name}: {error}") from error
     return []
 
 

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from dapdata.clouds import Points, thin
 from dapdata.config import ScansConfig
 from dapdata.interop.normals import by_camera, estimated_normals
-from dapdata.interop.scan_files import Fault, Scan, read
+from dapdata.interop.rpdiff_files import Fault
+from dapdata.interop.scan_files import Scan, read, rejected
 from dapdata.observe import CamerasConfig
 from dapdata.poses import inverse, rotate, transform
 from dapdata.records import Cloud, Demo, Rejected
@@ -51,14 +52,16 @@ def observe(config: ScansConfig, cameras: CamerasConfig, demo: Demo) -> Cloud | 
     """The clouds before, fused as our own; of the cameras section only voxels and least numbers are used."""
     try:
         prepared = prepare(read(config, int(demo.demo)), config)
+        container = prepared.fused("start", "container", cameras.container_voxel)
+        object_ = prepared.fused("start", "object", cameras.object_voxel)
+        for body, points, least in (
+            ("container", container.points, cameras.min_container_points),
+            ("object", object_.points, cameras.min_object_points),
+        ):
+            if len(points) < least:
+                raise Fault(f"too_few_{body}_points", f"{len(points)} when fused, expected {least}")
     except Fault as fault:
-        return Rejected(fault.reason)
-    container = prepared.fused("start", "container", cameras.container_voxel)
-    object_ = prepared.fused("start", "object", cameras.object_voxel)
-    if len(container.points) < cameras.min_container_points:
-        return Rejected("too_few_container_points")
-    if len(object_.points) < cameras.min_object_points:
-        return Rejected("too_few_object_points")
+        return rejected(config, int(demo.demo), fault)
     known = ~np.isnan(prepared.K).any(axis=(1, 2)).any()  # a shard holds no camera without intrinsics
     K, T = (prepared.K, prepared.T_world_camera) if known else (np.zeros((0, 3, 3)), np.zeros((0, 4, 4)))
     return Cloud(

@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 
 from dapdata import registration, solids
 from dapdata.config import ScansConfig
+from dapdata.interop.rpdiff_files import Fault
 from dapdata.interop.scan_clouds import Prepared, prepare
-from dapdata.interop.scan_files import STAGES, Fault, Scan, read
+from dapdata.interop.scan_files import STAGES, Scan, read, rejected
 from dapdata.poses import angle_between, inverse, nearest_symmetric, pose, rotation_about, transform, upright_turn
 from dapdata.records import GOAL_KINDS, SYMMETRIES, MeshDemo, Meshes, Rejected, pack_meshes
 from dapdata.registration import Fit, Surface
@@ -52,17 +53,7 @@ def demonstrate(config: ScansConfig, placement: PlacementConfig, demo: int) -> M
         prepared = prepare(scan, config)
         return _demo(scan, prepared, place(scan, prepared, config))
     except Fault as fault:
-        return Rejected(fault.reason)
-
-
-def explain(config: ScansConfig, demo: int) -> str:
-    """Why demonstration number `demo` is rejected, in a line with what was found and expected; "" if it is not, here."""
-    try:
-        scan = read(config, demo)
-        place(scan, prepare(scan, config), config)
-    except Fault as fault:
-        return f"{fault.reason}: {fault.found}"
-    return ""
+        return rejected(config, demo, fault)
 
 
 def place(scan: Scan, prepared: Prepared, config: ScansConfig) -> Placed:

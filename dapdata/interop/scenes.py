@@ -22,6 +22,7 @@ from dapdata import durable, pictures, records, solids
 from dapdata.card import Form
 from dapdata.errors import UsageError
 from dapdata.interop.export import Export, Piece, Progress, Row, by_demo, choose, demo_name, readme, run
+from dapdata.meshes import is_convex
 from dapdata.poses import pose
 from dapdata.records import Array, Mesh
 from dapdata.solids import BOX, CYLINDER, Color, Node
@@ -208,13 +209,15 @@ def _link(frame: Frame, folder: Path, mass: float | None = None) -> ElementTree.
     link = ElementTree.Element("link", name=frame.name)
     if mass is not None:
         link.append(_inertial(frame.parts, mass))
-    for i, (kind, size, T, _) in enumerate(zip(*frame.parts)):
+    for i, (kind, size, T, triangles) in enumerate(zip(*frame.parts)):
         mesh = folder / f"{frame.mesh}_{i}.stl"
         if kind not in (BOX, CYLINDER) and not mesh.exists():
             whole = frame.parts.of(np.array([i]))._replace(T=np.eye(4)[None]).to_trimesh()
             mesh.write_bytes(whole.export(file_type="stl"))
         for role in ("visual", "collision") if frame.collides else ("visual",):
             element = ElementTree.SubElement(link, role)
+            if role == "collision" and triangles is not None and not is_convex(triangles):
+                element.set("concave", "yes")  # PyBullet's own word; others pass over it
             _origin(element, T)
             geometry = ElementTree.SubElement(element, "geometry")
             if kind == BOX:

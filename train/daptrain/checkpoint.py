@@ -7,25 +7,29 @@
 - `metrics.jsonl`, `curves.png`.
 
 Every file is written beside its name, fsynced and renamed, so that a killed run leaves the old one or the new one.
+A run may come from anywhere: shapes are compared with the network's before anything is allocated.
 """
 
 from __future__ import annotations
 
 import json
-import os
 import platform
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import torch
+from pydantic import TypeAdapter, ValidationError
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save as to_bytes
 from torch import Tensor
 
+from dapdata import durable
 from dapdata.config import AT_INFERENCE, TrainConfig
-from dapdata.errors import CheckpointError, UsageError
+from dapdata.errors import CheckpointError, DapdataError, UsageError
 from daptrain.affordance import AffordanceNet
 from daptrain.pose import PoseNet
 
@@ -34,6 +38,10 @@ NetName = Literal["affordance", "pose"]
 Method = Literal["dap", "cap"]
 
 FORMAT = "dapdata-run-1"
+CONFIG = "config.json"
+MAX_CONFIG = 10_000_000  # bytes
+MOMENTS = ("exp_avg", "exp_avg_sq")  # of AdamW
+SHORT = {torch.float32: "F32", torch.float64: "F64", torch.int64: "I64", torch.bool: "BOOL"}  # types in safetensors' words
 NETS: dict[str, type[AffordanceNet] | type[PoseNet]] = {"affordance": AffordanceNet, "pose": PoseNet}
 WORST = -1e9  # score before the first validation
 # Keys that do not change what is learned: a run may go on, or be used, with other values.
@@ -49,6 +57,9 @@ class Progress:
     best: float = WORST
     best_step: int = 0
     minutes: float = 0.0  # largest budget of minutes that was used up
+
+
+PROGRESS = TypeAdapter(Progress)
 
 
 def describe(
@@ -72,31 +83,35 @@ def describe(
     }
 
 
-def start_run(run: Path, description: dict[str, Any]) -> None:
-    """Makes the run folder, or makes sure that the one that is there was trained on the same.
+def check_run(run: Path, description: dict[str, Any]) -> None:
+    """Refuses a folder that holds something else than a run which was trained on the same. Writes nothing.
 
     Raises:
         CheckpointError: the folder holds another run; the message says what differs.
+        UsageError: it holds no run.
     """
-    if (run / "config.json").exists():
+    if (run / CONFIG).exists():
         there = read_description(run)
         for what in ("task", "method", "networks", "dataset"):
-            if there.get(what) != description[what]:
+            if there[what] != description[what]:
                 raise CheckpointError(
-                    f"{run}: was trained with {what} {there.get(what)}, now it is {description[what]}; "
+                    f"{run}: was trained with {what} {there[what]}, now it is {description[what]}; "
                     "give another folder with --run, or delete this one"
                 )
-        before = there.get("train", {})
         for key, value in description["train"].items():
-            if key not in FREE_KEYS and before.get(key) != value:
+            if key not in FREE_KEYS and there["train"].get(key) != value:
                 raise CheckpointError(
-                    f"{run}: was trained with train.{key} {before.get(key)}, now it is {value}; "
+                    f"{run}: was trained with train.{key} {there['train'].get(key)}, now it is {value}; "
                     "give another folder with --run, or delete this one"
                 )
-    elif run.is_file() or (run.is_dir() and any(run.iterdir())):
+    elif durable.is_occupied(run):
         raise UsageError(f"{run}: is there and is no run, expected an empty or a new folder; give another one with --run")
-    run.mkdir(parents=True, exist_ok=True)
-    write_whole(run / "config.json", (json.dumps(description, indent=2) + "\n").encode())
+
+
+def start_run(run: Path, description: dict[str, Any]) -> None:
+    """Makes the run folder, or makes sure that the one that is there was trained on the same; raises as `check_run`."""
+    check_run(run, description)
+    write_whole(run / CONFIG, (json.dumps(description, indent=2) + "\n").encode())
 
 
 def read_description(run: Path) -> dict[str, Any]:
@@ -105,17 +120,25 @@ def read_description(run: Path) -> dict[str, Any]:
     Raises:
         CheckpointError: no run, or one of another format.
     """
+    path = run / CONFIG
     try:
-        description = json.loads((run / "config.json").read_bytes())
+        description = durable.read_json(path, MAX_CONFIG)
+        found = description.get("format") if isinstance(description, dict) else None
+        if found != FORMAT:
+            raise CheckpointError(f"{path}: got format {found!r:.80}, expected '{FORMAT}'; train again with this version")
+        for name, kind in {"task": str, "dataset": str, "networks": dict, "train": dict, "recipe": dict}.items():
+            if not isinstance(description.get(name), kind):
+                raise ValueError(f"{name}: got {type(description.get(name)).__name__}, expected {kind.__name__}")
+        if description.get("method") not in get_args(Method):
+            raise ValueError(f"method: got {description.get('method')!r:.80}, expected one of {', '.join(get_args(Method))}")
     except FileNotFoundError as error:
         raise CheckpointError(
             f"{run}: no config.json in there, expected a run folder; train one first with `dapdata train`"
         ) from error
     except (OSError, ValueError) as error:
-        raise CheckpointError(f"{run}/config.json: {error}, expected JSON as `dapdata train` writes it") from error
-    found = description.get("format") if isinstance(description, dict) else None
-    if found != FORMAT:
-        raise CheckpointError(f"{run}/config.json: got format {found!r}, expected '{FORMAT}'; train again with this version")
+        if isinstance(error, CheckpointError):
+            raise
+        raise CheckpointError(f"{path}: {error}, expected JSON as `dapdata train` writes it; train again") from error
     return dict(description)
 
 
@@ -135,26 +158,40 @@ def load_network(run: Path, name: str, description: dict[str, Any], config: Trai
     path = run / f"{name}.safetensors"
     if not path.exists():
         raise CheckpointError(f"{path}: not there; train it first: dapdata train --run {run} --net {name}")
-    tensors, metadata = read_tensors(path)
-    network = NETS[name](config, description["method"])
-    wanted = {"network": name, "version": network.version, "task": description["task"], "method": network.method}
-    for key, value in wanted.items():
-        if metadata.get(key) != value:
-            raise CheckpointError(f"{path}: has weights of {key} '{metadata.get(key)}', expected '{value}'; train again")
-    load_tensors_into(network, tensors, path)
+    with opened(path) as (file, metadata):
+        wanted = {"network": name, "version": NETS[name].version, "task": description["task"], "method": description["method"]}
+        for key, value in wanted.items():
+            if metadata.get(key) != value:
+                raise CheckpointError(
+                    f"{path}: has weights of {key} '{str(metadata.get(key))[:80]}', expected '{value}'; train again"
+                )
+        with torch.device("meta"):  # a config may ask for any width: nothing is allocated before the file has as many numbers
+            outline = NETS[name](config, description["method"])
+        check_shapes(file, outline.state_dict(), path)
+        network = NETS[name](config, description["method"])
+        load_tensors_into(network, {key: file.get_tensor(key) for key in file.keys()}, path)  # noqa: SIM118
     return network.to(device).eval()
 
 
-def load_tensors_into(network: Net, tensors: dict[str, Tensor], path: Path) -> None:
-    """Sets a network's weights; refuses other names, other shapes and numbers that are not finite."""
-    expected = {key: tuple(value.shape) for key, value in network.state_dict().items()}
-    found = {key: tuple(value.shape) for key, value in tensors.items()}
-    if wrong := sorted(key for key in expected.keys() | found.keys() if expected.get(key) != found.get(key)):
+def check_shapes(file: Any, expected: Mapping[str, Tensor], path: Path) -> None:
+    """Refuses a safetensors file with other names, other shapes or other types than expected; reads its header alone."""
+    shapes = {key: (tuple(value.shape), SHORT[value.dtype]) for key, value in expected.items()}
+    pieces = {key: file.get_slice(key) for key in file.keys()}  # noqa: SIM118
+    found = {key: (tuple(piece.get_shape()), piece.get_dtype()) for key, piece in pieces.items()}
+    if wrong := sorted(key for key in shapes.keys() | found.keys() if shapes.get(key) != found.get(key)):
         key = wrong[0]
         raise CheckpointError(
-            f"{path}: {key} has shape {found.get(key)}, this network's config expects {expected.get(key)}"
-            f" ({len(wrong)} of {len(expected)} arrays differ); train again"
+            f"{path}: {key[:80]} has shape {_words(found.get(key))}, this network's config expects {_words(shapes.get(key))}"
+            f" ({len(wrong)} of {len(shapes)} arrays differ); train again"
         )
+
+
+def _words(shape: tuple[tuple[int, ...], str] | None) -> str:
+    return "none" if shape is None else f"{shape[0]} of {shape[1]}"
+
+
+def load_tensors_into(network: Net, tensors: dict[str, Tensor], path: Path) -> None:
+    """Sets a network's weights, which have its shapes; refuses numbers that are not finite."""
     if bad := [key for key, value in tensors.items() if not value.isfinite().all()]:
         raise CheckpointError(f"{path}: {bad[0]} has numbers that are not finite; train again")
     network.load_state_dict(tensors)
@@ -182,27 +219,45 @@ def load_state(run: Path, network: Net, optimizer: torch.optim.Optimizer, averag
     path = run / f"{network.name}.state.safetensors"
     if not path.exists():
         return Progress()
-    tensors, metadata = read_tensors(path)
-    if (found := (metadata.get("network"), metadata.get("version"))) != (expected := (network.name, network.version)):
-        raise CheckpointError(f"{path}: has the state of {found}, expected {expected}; give another folder with --run")
-    try:
-        progress = Progress(**metadata["progress"])
-        weights = {key.removeprefix("weights/"): x for key, x in tensors.items() if key.startswith("weights/")}
+    with opened(path) as (file, metadata):
+        found = (metadata.get("network"), metadata.get("version"))
+        if found != (expected := (network.name, network.version)):
+            raise CheckpointError(
+                f"{path}: has the state of {found!r:.80}, expected {expected}; give another folder with --run"
+            )
+        progress = _progress(metadata, path)
+        # There are no moments before the first step that counted.
+        has_moments = any(key.startswith("optimizer/") for key in file.keys())  # noqa: SIM118
+        check_shapes(file, _outline(network, has_moments), path)
+        weights = {key: file.get_tensor(f"weights/{key}") for key in network.state_dict()}
         load_tensors_into(network, weights, path)
-        has_moments = any(key.startswith("optimizer/") for key in tensors)  # none before the first step that counted
         for key, value in network.named_parameters():
-            average[key].copy_(tensors[f"average/{key}"])
-            if not has_moments:
-                continue
-            optimizer.state[value] = {
-                moment: tensors[f"optimizer/{key}/{moment}"].to("cpu" if moment == "step" else value.device)
-                for moment in ("step", "exp_avg", "exp_avg_sq")
-            }
-    except (KeyError, TypeError, ValueError, RuntimeError) as error:
-        if isinstance(error, CheckpointError):
-            raise
-        raise CheckpointError(f"{path}: {error!r}, expected a state written by this version; delete the run folder") from error
+            average[key].copy_(file.get_tensor(f"average/{key}"))
+            if has_moments:
+                optimizer.state[value] = {
+                    moment: file.get_tensor(f"optimizer/{key}/{moment}").to("cpu" if moment == "step" else value.device)
+                    for moment in ("step", *MOMENTS)
+                }
     return progress
+
+
+def _outline(network: Net, has_moments: bool) -> dict[str, Tensor]:
+    """Every array of a network's state, by name: only their shapes and types mean something."""
+    arrays = {f"weights/{key}": value for key, value in network.state_dict().items()}
+    for key, value in network.named_parameters():
+        arrays[f"average/{key}"] = value
+        if has_moments:
+            arrays |= {f"optimizer/{key}/{moment}": value for moment in MOMENTS}
+            arrays[f"optimizer/{key}/step"] = torch.zeros(())
+    return arrays
+
+
+def _progress(metadata: Mapping[str, Any], path: Path) -> Progress:
+    """Where a state stands, as its metadata say."""
+    try:
+        return PROGRESS.validate_python(metadata["progress"])
+    except (KeyError, ValidationError) as error:
+        raise CheckpointError(f"{path}: has no progress, expected a state written by this version; delete the run") from error
 
 
 def packed(tensors: dict[str, Tensor], metadata: dict[str, Any]) -> bytes:
@@ -215,30 +270,36 @@ def is_spent(run: Path, name: str, steps: int | None, minutes: float | None) -> 
     path = run / f"{name}.state.safetensors"
     if not path.exists() or not (run / f"{name}.last.safetensors").exists():
         return False
-    progress = Progress(**read_tensors(path)[1].get("progress", {}))
+    with opened(path) as (_, metadata):
+        progress = _progress(metadata, path)
     return (steps is not None and progress.step >= steps) or (minutes is not None and progress.minutes >= minutes)
 
 
-def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """All arrays and the metadata of a safetensors file that `packed` made."""
+@contextmanager
+def opened(path: Path) -> Iterator[tuple[Any, dict[str, Any]]]:
+    """A safetensors file that `packed` made, and its metadata.
+
+    Raises:
+        CheckpointError: if it is none, also when an array cannot be read from it.
+    """
     try:
+        if not path.is_file():
+            raise ValueError("no plain file")
         with safe_open(path, framework="pt") as file:
-            metadata = json.loads((file.metadata() or {}).get("dapdata", "{}"))
-            return {key: file.get_tensor(key) for key in file.keys()}, dict(metadata)  # noqa: SIM118
-    except (SafetensorError, OSError, ValueError, TypeError) as error:
-        raise CheckpointError(f"{path}: {error}, expected safetensors as `dapdata train` writes them; train again") from error
+            yield file, dict(json.loads((file.metadata() or {}).get("dapdata", "{}")))
+    except (SafetensorError, OSError, ValueError, TypeError, KeyError, RecursionError) as error:
+        if isinstance(error, DapdataError):
+            raise
+        raise CheckpointError(
+            f"{path}: {str(error)[:160]!r}, expected safetensors as `dapdata train` writes them; train again"
+        ) from error
 
 
 def write_whole(path: Path, content: bytes) -> None:
-    """Writes a file beside its name, fsyncs it and renames it: others see the old content or the new."""
-    beside = path.with_name(path.name + ".part")
-    with beside.open("wb") as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
-    beside.replace(path)
-    folder = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(folder)
-    finally:
-        os.close(folder)
+    """Writes a file beside its name, fsyncs it and renames it: others see the old content or the new.
+
+    Raises:
+        EnvironmentProblem: if the disk is full; what was there before still is.
+    """
+    with durable.disk_problems(path.parent, len(content)):
+        durable.replace_file(path, content)

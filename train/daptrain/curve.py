@@ -24,7 +24,7 @@ from typing import Any, Literal, cast
 
 from pydantic import ValidationError
 
-from dapdata import loading
+from dapdata import durable, loading
 from dapdata.config import AT_INFERENCE, EvalConfig, TrainConfig
 from dapdata.errors import CheckpointError, FormatError, UsageError
 from dapdata.loading import Dataset
@@ -117,7 +117,7 @@ def curve(
     """
     say = say or (lambda line: print(line, file=sys.stderr, flush=True))
     out, dataset = Path(out), loading.open(data, "train")
-    config = config or TrainConfig.model_validate(dataset.recipe["train"])
+    config = config or dataset.section("train", TrainConfig)
     if method not in LEARNED:
         raise UsageError(f"method: got '{method}', which learns nothing, expected one of {', '.join(LEARNED)}")
     sizes = check_sizes(sizes, dataset)
@@ -175,7 +175,7 @@ def judging_settings(
     if len(dataset) == 0:
         raise UsageError(f"{dataset.root}: split '{split}': got 0 demos, expected at least 1; choose another split")
     given = {"trials": trials, "protocol": protocol, "k": k, "draws": draws}
-    usual = EvalConfig.model_validate(dataset.recipe.get("eval", {})).model_dump()
+    usual = dataset.section("eval", EvalConfig).model_dump()
     found = usual | {name: value for name, value in given.items() if value is not None}
     found["trials"] = min(found["trials"], len(dataset))
     found["draws"] = found["draws"] if draws is not None else max(found["draws"] or found["k"], found["k"])
@@ -215,7 +215,7 @@ def begun(out: Path, wanted: Asked) -> Curve:
     """
     path = out / "curve.json"
     if not path.exists():
-        if out.is_file() or (out.is_dir() and any(out.iterdir()) and not (out / "config.json").exists()):
+        if durable.is_occupied(out) and not (out / "config.json").exists():
             raise UsageError(
                 f"{out}: is there and is no curve, expected a new folder, a curve's or a run's; give another one with --out"
             )

@@ -100,8 +100,8 @@ def evaluate(
     say = seldom(say or (lambda line: print(line, file=sys.stderr, flush=True)))
     predictor = _load(run, method, device, changes or {})
     dataset = loading.open(data if data is not None else data_of(run), split)
-    config = EvalConfig.model_validate(dataset.recipe.get("eval", {}))
-    usual = TrainConfig.model_validate(dataset.recipe.get("train", {}))
+    config = dataset.section("eval", EvalConfig)
+    usual = dataset.section("train", TrainConfig)
     trials, k, protocol = trials or config.trials, k or config.k, protocol or config.protocol
     if draws is not None and draws < k:
         raise UsageError(f"draws: got {draws}, expected at least k ({k}): what is judged was drawn; give more, or a smaller k")

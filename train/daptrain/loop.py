@@ -22,7 +22,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -31,9 +31,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dapdata import durable
 from dapdata import rng as random
 from dapdata.config import TrainConfig
-from dapdata.errors import UsageError
+from dapdata.errors import FormatError, UsageError
 from dapdata.loading import Dataset
 from daptrain import affordance, diffusion, pose
 from daptrain.affordance import AffordanceNet
@@ -43,6 +44,7 @@ from daptrain.checkpoint import (
     Net,
     NetName,
     Progress,
+    check_run,
     describe,
     is_spent,
     load_state,
@@ -130,12 +132,14 @@ def train(
     Raises:
         CheckpointError: the run folder holds a run on other data or with another config.
         UsageError: no demo to train on, a bad device, a budget that is none.
+        LockedError: another process trains this run.
+        EnvironmentProblem: the disk is full; the last checkpoint is there.
     """
     from dapdata.loading import open as open_dataset
 
     started = time.monotonic()
     whole, train_split, val_split = (open_dataset(dataset, split=split) for split in (None, "train", "val"))
-    config = config or TrainConfig.model_validate(whole.recipe["train"])
+    config = config or whole.section("train", TrainConfig)
     check_budget(minutes, steps)
     minutes = config.minutes if minutes is None and steps is None else minutes
     run, where, task = Path(run), pick_device(device), whole.task
@@ -143,31 +147,49 @@ def train(
     if not names:
         raise UsageError(f"net: got '{net}', expected both, affordance or pose")
     demos = demos_used(train_split, config)
-    start_run(
-        run, describe(str(dataset), task, whole.digest, whole.recipe, config, method, str(where)) | {"data": str(dataset)}
-    )
-    names = [name for name in names if not is_spent(run, name, steps, minutes)]
-    if not names:
-        say(f"{run}: trained already with this budget; give more --minutes or --steps to go on")
-        return run
-    rule = LabelRule(whole.recipe["label"]["eps_place"], whole.recipe["label"]["kind"])
+    description = describe(str(dataset), task, whole.digest, whole.recipe, config, method, str(where)) | {"data": str(dataset)}
+    check_run(run, description)
+    with durable.disk_problems(run), durable.lock(run):
+        start_run(run, description)
+        names = [name for name in names if not is_spent(run, name, steps, minutes)]
+        if not names:
+            say(f"{run}: trained already with this budget; give more --minutes or --steps to go on")
+            return run
+        material = learned_from(whole, train_split, val_split, demos, config)
+        seconds = None if minutes is None else 60 * minutes - (time.monotonic() - started)
+        side_by_side = where.type == "cpu" and len(names) > 1 and cores() > 1
+        asked = {}
+        for name in names:
+            part = 1.0 if side_by_side or net != "both" else PARTS[name](config)
+            asked[name] = Budget(steps, None if seconds is None else part * seconds, minutes or 0.0)
+        fit_all(asked, material, run, config, method, where, workers=len(names) if side_by_side else 1)
+        draw_curves(run)
+    return run
+
+
+def learned_from(whole: Dataset, train_split: Dataset, val_split: Dataset, demos: int, config: TrainConfig) -> Material:
+    """The first demos of the train split, and those of the val split that are looked at while training."""
+    rule = label_rule(whole)
     every_goal = config.model_copy(update={"goals": "all"})  # validation asks whether a sample is any valid goal
-    material = Material(
+    return Material(
         prepared(train_split, demos, rule, config),
         prepared(val_split, min(len(val_split), VALIDATION_SCENES), rule, every_goal),
         rule,
         int(whole.recipe["seed"]) if config.seed is None else config.seed,
-        task,
+        whole.task,
     )
-    seconds = None if minutes is None else 60 * minutes - (time.monotonic() - started)
-    side_by_side = where.type == "cpu" and len(names) > 1 and cores() > 1
-    asked = {}
-    for name in names:
-        part = 1.0 if side_by_side or net != "both" else PARTS[name](config)
-        asked[name] = Budget(steps, None if seconds is None else part * seconds, minutes or 0.0)
-    fit_all(asked, material, run, config, method, where, workers=len(names) if side_by_side else 1)
-    draw_curves(run)
-    return run
+
+
+def label_rule(dataset: Dataset) -> LabelRule:
+    """How a dataset labelled affordance; a FormatError if its recipe does not say."""
+    label = dataset.recipe.get("label")
+    if (
+        not isinstance(label, dict)
+        or not isinstance(label.get("eps_place"), float)
+        or label.get("kind") not in ("hard", "soft")
+    ):
+        raise FormatError(f"{dataset.root}: recipe.label: got {label!r:.80}, expected eps_place and kind; label it again")
+    return LabelRule(label["eps_place"], label["kind"])
 
 
 def fit_all(
@@ -272,7 +294,7 @@ def fit(
     if not any((example.targets.affordance > 0).any() for example in material.train):
         raise UsageError(f"{run}: no demo of the train split has a container point near its goal; generate more demos")
     network = build(name, config, method, material).to(device)
-    optimizer = torch.optim.AdamW(network.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay)
+    optimizer = torch.optim.AdamW(network.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay, fused=True)
     average = {key: value.detach().clone() for key, value in network.named_parameters()}
     progress = load_state(run, network, optimizer, average)
     budget.before, budget.started = progress.seconds, time.monotonic()
@@ -549,10 +571,13 @@ def log(run: Path, entry: dict[str, Any]) -> None:
 
 
 def read_metrics(run: Path) -> list[dict[str, Any]]:
-    """All entries of metrics.jsonl; a last line that a kill cut short is left out."""
-    path = run / "metrics.jsonl"
-    lines = path.read_text().split("\n")[:-1] if path.exists() else []
-    return [json.loads(line) for line in lines]
+    """All entries of metrics.jsonl; lines that a kill or a power cut damaged are left out."""
+    path, entries = run / "metrics.jsonl", []
+    for line in path.read_text(errors="replace").split("\n")[:-1] if path.exists() else ():
+        with suppress(ValueError):
+            entry = json.loads(line)
+            entries += [entry] if isinstance(entry, dict) and {"net", "step"} <= entry.keys() else []
+    return entries
 
 
 def keep_metrics(run: Path, name: str, step: int) -> None:

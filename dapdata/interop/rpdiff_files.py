@@ -108,13 +108,13 @@ def find(source: str) -> tuple[tuple[Place, ...], str]:
     root = Path(source)
     if not root.exists():
         raise FormatError(f"{root}: no such file or folder, expected demos of RPDiff (demo_aug_*.npz); check the path")
-    files = [root] if root.is_file() else sorted(_below(root, (".npz",)), key=natural)
+    files = [root] if root.is_file() else sorted(below(root, (".npz",)), key=natural)
     files = [file for file in files if SLOTS not in file.name]
     places, whole, recognised = list[Place](), sha256(), False
     for file in files:
         name = file.name if root.is_file() else file.relative_to(root).as_posix()
         try:
-            members = object_arrays.member_names(file) if root.is_file() or _is_inside(file, root) else {}
+            members = object_arrays.member_names(file) if root.is_file() or is_inside(file, root) else {}
         except FormatError:
             members = {}
         is_chunk = bool(members) and all(name.isdecimal() for name in members)
@@ -128,7 +128,7 @@ def find(source: str) -> tuple[tuple[Place, ...], str]:
     return tuple(places), whole.hexdigest()
 
 
-def _below(root: Path, suffixes: tuple[str, ...]) -> Iterator[Path]:
+def below(root: Path, suffixes: tuple[str, ...]) -> Iterator[Path]:
     """The files with one of some suffixes in a folder and all below it.
 
     Raises:
@@ -141,7 +141,7 @@ def _below(root: Path, suffixes: tuple[str, ...]) -> Iterator[Path]:
         yield from (Path(folder, name) for name in names if name.lower().endswith(suffixes))
 
 
-def _is_inside(path: Path, root: Path) -> bool:
+def is_inside(path: Path, root: Path) -> bool:
     """Whether a file is in a folder, and no link that leads out of it."""
     return path.is_file() and path.resolve().is_relative_to(root.resolve())
 
@@ -181,8 +181,8 @@ def mesh_folder(folder: str) -> MeshFolder:
         raise FormatError(f"{root}: no such folder, expected meshes ({', '.join(meshes.SUFFIXES)}); check --meshes")
     found: dict[str, tuple[Path, ...]] = {}
     whole = sha256()
-    for path in sorted(_below(root, (*meshes.SUFFIXES, *SLOT_SUFFIXES)), key=natural):
-        if _is_inside(path, root):
+    for path in sorted(below(root, (*meshes.SUFFIXES, *SLOT_SUFFIXES)), key=natural):
+        if is_inside(path, root):
             found[path.name] = (*found.get(path.name, ()), path)
             whole.update(durable.canonical([path.relative_to(root).as_posix(), durable.hash_file(path)]))
     if not any(name.lower().endswith(meshes.SUFFIXES) for name in found):
@@ -267,7 +267,7 @@ def read_fields(config: RpdiffConfig, demo: int) -> Fields:
         FormatError: the source has changed since its digest was taken.
     """
     place = _place(config, demo)
-    if not (Path(config.source).is_file() or _is_inside(place.file, Path(config.source))):
+    if not (Path(config.source).is_file() or is_inside(place.file, Path(config.source))):
         raise Fault("outside", "expected a file; import the folder that it leads to")
     try:
         if place.chunk_key is not None:

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from dapdata.clouds import Points, thin
 from dapdata.config import ScansConfig
 from dapdata.interop.normals import by_camera, estimated_normals
-from dapdata.interop.scan_files import Fault, Scan, read, rejected
+from dapdata.interop.rpdiff_files import Fault
+from dapdata.interop.scan_files import Scan, read, rejected
 from dapdata.observe import CamerasConfig
 from dapdata.poses import inverse, rotate, transform
 from dapdata.records import Cloud, Demo, Rejected

@@ -22,7 +22,7 @@ from dapdata import clouds, durable, npz
 from dapdata.clouds import Points
 from dapdata.config import ScansConfig, Section, key
 from dapdata.errors import FormatError, UsageError
-from dapdata.interop.rpdiff_files import natural
+from dapdata.interop.rpdiff_files import Fault, below, is_inside, natural
 from dapdata.poses import pose, rotate, rotation_about, transform
 from dapdata.records import Rejected
 
@@ -61,14 +61,6 @@ SAMPLE = 65_536  # bytes at the beginning, middle and end of a file by which ano
 LEVEL = 0.01  # m: thickness of a table in a scan
 FOOT_SHARE, FOOT_WIDER = (0.25, 0.97), 4.0  # shares of points and times the area that make a foot a table
 LEVEL_SHARE = 2.0  # times as many of the rest's points lie in one layer across another axis: that one is up
-
-
-class Fault(Exception):  # noqa: N818, it is no error
-    """Why a demonstration is rejected: one of REASONS, and what was found."""
-
-    def __init__(self, reason: str, found: str) -> None:
-        super().__init__(reason)
-        self.reason, self.found = reason, found
 
 
 class CameraAbout(Section):
@@ -123,7 +115,7 @@ def find(source: str) -> tuple[tuple[Path, ...], str]:
     root = Path(source)
     if not root.is_dir():
         raise FormatError(f"{root}: no such folder, expected one with a folder for each demonstration; check the path")
-    files = [path for path in sorted(root.rglob("*"), key=natural) if path.is_file()]
+    files = [path for path in sorted(below(root, (*SUFFIXES, ".npy", ".json")), key=natural) if is_inside(path, root)]
     ours = [path for path in files if path.name == ABOUT or (path.suffix.lower() in SUFFIXES and path.stem in CLOUDS)]
     labels = [path for path in files if path.name in {f"{stage}_labels.npy" for stage in STAGES}]
     folders = tuple(dict.fromkeys(path.parent for path in ours if path.name != ABOUT))
@@ -152,11 +144,6 @@ def scene_section(source: str) -> dict[str, Any]:
     return {"task": "scans", "source": source, "source_sha256": find(source)[1]}
 
 
-def rejected(config: ScansConfig, demo: int, fault: Fault) -> Rejected:
-    """What becomes of demonstration number `demo` of the source, with its folder in the detail."""
-    return Rejected(fault.reason, f"{folder_of(config, demo).name}: {fault.found}")
-
-
 def folder_of(config: ScansConfig, demo: int) -> Path:
     """Where demonstration number `demo` is, in the source that was asked for and no other."""
     folders, digest = find(config.source)
@@ -165,6 +152,11 @@ def folder_of(config: ScansConfig, demo: int) -> Path:
     if demo >= len(folders):
         raise UsageError(f"{config.source}: demo {demo} of {len(folders)}, expected at most {len(folders)}; lower --demos")
     return folders[demo]
+
+
+def rejected(config: ScansConfig, demo: int, fault: Fault) -> Rejected:
+    """What becomes of demonstration number `demo` of the source, with its folder in the detail."""
+    return Rejected(fault.reason, f"{folder_of(config, demo).name}: {fault.detail}")
 
 
 # What a demonstration holds --------------------------------------------------------------------------------

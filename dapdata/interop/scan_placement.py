@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 
 from dapdata import registration, solids
 from dapdata.config import ScansConfig
+from dapdata.interop.rpdiff_files import Fault
 from dapdata.interop.scan_clouds import Prepared, prepare
-from dapdata.interop.scan_files import STAGES, Fault, Scan, read, rejected
+from dapdata.interop.scan_files import STAGES, Scan, read, rejected
 from dapdata.poses import angle_between, inverse, nearest_symmetric, pose, rotation_about, transform, upright_turn
 from dapdata.records import GOAL_KINDS, SYMMETRIES, MeshDemo, Meshes, Rejected, pack_meshes
 from dapdata.registration import Fit, Surface

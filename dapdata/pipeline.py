@@ -454,6 +454,7 @@ class _Command:
 # Around the commands ---------------------------------------------------------------------------------------
 
 QUARANTINE = "quarantine"
+FOLDERS = ("shards", "stages", QUARANTINE, manifest.PREVIEWS)  # of a dataset
 START_TIMEOUT = 300.0  # s: imports, and numba's first compilation
 DEMO_TIMEOUT = 20.0  # s a demo: a hundred times what one takes
 PATIENCE = 60.0  # s to wait for a lock that is held for moments: by who looks whether all units are there, or publishes
@@ -473,7 +474,7 @@ def timeout(unit: Unit) -> float:
 
 def _check_folder(root: Path) -> None:
     """Refuses to write among somebody's other files."""
-    ours = (manifest.MANIFEST, manifest.PROGRESS, manifest.LOG, manifest.INDEX, "stages", "shards", QUARANTINE)
+    ours = (manifest.MANIFEST, manifest.PROGRESS, manifest.LOG, manifest.INDEX, *FOLDERS)
     if root.exists() and not root.is_dir():
         raise FormatError(f"{root}: a file, expected a folder for the dataset; choose another with --out")
     if durable.is_occupied(root) and not any((root / name).exists() for name in ours):
@@ -504,7 +505,7 @@ def _clear(root: Path) -> None:
     durable.remove_file(root / manifest.MANIFEST)
     for name in (manifest.PROGRESS, manifest.LOG, *manifest.single_files(root)):
         durable.remove_file(root / name)
-    for folder in ("shards", "stages", QUARANTINE):
+    for folder in FOLDERS:
         if (root / folder).is_dir():
             durable.discard(root, root / folder)
 

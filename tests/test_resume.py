@@ -158,6 +158,20 @@ def test_an_interrupted_command_says_how_far_it_came_and_what_is_left(
     assert manifest.read(root).content_sha256 == manifest.read(toy).content_sha256
 
 
+def test_what_a_kill_left_of_an_empty_dataset_is_no_reason_to_refuse_it_and_a_run_is_one(in_memory: Path) -> None:
+    root = in_memory / "toy"
+    (root / manifest.PREVIEWS).mkdir(parents=True)  # `generate --fresh` was about to remove the last of all
+    (root / durable.LOCK).touch()
+    (root / ".progress.json.here.123.tmp").write_text("{")
+    make_toy(root, 2, 2)
+    assert health.verify(root).ok
+    (in_memory / "run").mkdir()
+    for name in (durable.LOCK, "config.json"):
+        (in_memory / "run" / name).touch()
+    with pytest.raises(FormatError, match="a folder with other files and no dataset"):
+        make_toy(in_memory / "run", 2, 2)
+
+
 # A full disk -------------------------------------------------------------------------------------------------
 
 

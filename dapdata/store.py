@@ -242,7 +242,7 @@ def write_unit(
             if lender:
                 files |= _borrow(folder, path, lender)
             else:
-                _write_array(subgroup, path, array() if callable(array) else array)
+                _write_array(folder, subgroup, path, array() if callable(array) else array)
     files |= {path: fact for path, fact in _hash_all(folder).items() if path not in files}
     record = {**about, "files": dict(sorted(files.items()))}
     group.attrs["dapdata"] = record
@@ -267,26 +267,30 @@ def _concatenated(column: Field[Any], samples: Sequence[Sample]) -> Array:
     return np.concatenate(parts) if is_ragged(column) else np.stack(parts)
 
 
-def _write_array(group: Any, path: str, array: Array) -> None:
+def _write_array(folder: Path, group: Any, path: str, array: Array) -> None:
+    """An array of a group of the unit in this folder: zarr describes it, its rows are written straight."""
     from zarr.codecs import Crc32cCodec, ZstdCodec
 
     about = _about(path)
+    fill = {"f": np.nan, "i": -1, "u": np.iinfo(np.uint8).max}[array.dtype.kind]
     rows = max(len(array), 1)
     chunk = min(rows, MAX_CHUNK_ROWS)
-    target = group.create_array(
+    group.create_array(
         path.split("/")[1],
         shape=array.shape,
         dtype=array.dtype,
         chunks=(chunk, *array.shape[1:]),
         shards=(-(-rows // chunk) * chunk, *array.shape[1:]),
         compressors=[ZstdCodec(level=ZSTD_LEVEL), Crc32cCodec()],
-        fill_value={"f": np.nan, "i": -1, "u": np.iinfo(np.uint8).max}[array.dtype.kind],
+        fill_value=fill,
         dimension_names=_dimension_names(about),
         attributes=_attributes(about),
-        config={"write_empty_chunks": True},
     )
     if len(array):
-        target[...] = array
+        layout = chunks.Layout(array.shape, array.dtype, chunk, -(-rows // chunk))
+        file = folder / path / layout.name
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_bytes(chunks.encode(layout, array, fill, ZSTD_LEVEL))
 
 
 def _about(path: str) -> Mapping[str, Any]:

@@ -21,7 +21,7 @@ def write(folder: Path, array: np.ndarray, chunk: int) -> Path:
         patch.setattr(store, "MAX_CHUNK_ROWS", chunk)
         group = zarr.open_group(folder, mode="w", zarr_format=3)
         path = "container/points" if array.ndim == 2 else "container/offsets"
-        store._write_array(group.create_group("container"), path, array)
+        store._write_array(folder, group.create_group("container"), path, array)
     return folder / path
 
 
@@ -47,6 +47,18 @@ def test_what_is_read_is_what_zarr_reads(
     assert found.dtype.str == dtype
     np.testing.assert_array_equal(found, array)
     np.testing.assert_array_equal(found, zarr.open_array(folder, mode="r")[...])
+
+
+@pytest.mark.parametrize("rows", [1, 7, 20])
+@pytest.mark.parametrize("dtype", ["<f4", "<i8", "|u1"])
+def test_what_is_written_is_what_zarr_writes_byte_for_byte(tmp_path: Path, rows: int, dtype: str) -> None:
+    array = np.random.default_rng(rows).integers(0, 9, (rows, 3)).astype(dtype)
+    folder = write(tmp_path, array, 7)
+    (file,) = [path for path in (folder / "c").rglob("*") if path.is_file()]
+    ours = file.read_bytes()
+    file.unlink()
+    zarr.open_array(folder, mode="r+", config={"write_empty_chunks": True})[...] = array
+    assert file.read_bytes() == ours
 
 
 def test_no_bit_can_flip_unseen(tmp_path: Path) -> None:

@@ -73,7 +73,9 @@ FIXED = {  # below SCENE, so that the first line is number 3: what is said after
     "train:\n  preset: papr": "4: train.preset: got 'papr', expected one of default, paper; did you mean 'paper'?",
     "eval:\n  k: 0": "4: eval.k: got 0, expected a whole number, 1 to 1024",
     "eval:\n  k: 9\n  draws: 4": "3: eval: draws: got 4, expected at least k (9), or null for as many",
-    "eval:\n  protocol: strikt": "4: eval.protocol: got 'strikt', expected one of strict, rpdiff, shown; did you mean 'strict'?",
+    "eval:\n  protocol: strikt": (
+        "4: eval.protocol: got 'strikt', expected one of strict, rpdiff, shown; did you mean 'strict'?"
+    ),
     "label: {eps_place: 0.03}\nlabel: {}": "4: label: given twice, first at line 3, expected once; remove one",
     "label:\n\teps_place: 0.03": "4: not YAML",
     "label:\n  eps_place: *eps": "4: anchors and aliases (& and *) are not read, expected each value written out",

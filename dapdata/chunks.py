@@ -1,4 +1,4 @@
-"""Arrays of a unit straight from and to their files: zarr's own layout (version 3, sharded, zstd, crc32c), without its machinery.
+"""Arrays of a unit straight from and to their files: zarr's layout (version 3, sharded, zstd, crc32c), without its machinery.
 
 zarr takes 4 ms to read one of our arrays and 2.5 to write its rows, nearly all of it to hand small pieces of work to its event
 loop; this takes 0.3 and 0.9 ms. What is written is what zarr writes, byte for byte.

@@ -1,4 +1,4 @@
-"""Units on disk: the only door to zarr, which writes them; `chunks` reads them faster than it does.
+"""Units on disk: the only door to zarr, in whose layout `chunks` writes and reads them, byte for byte as it does, but faster.
 
 A unit is one Zarr v3 group that holds some demos: the columns of `records` as concatenated rows, an `offsets`
 array for each ragged group, and in the root's attributes under `dapdata` the unit's own record: key, demos,
@@ -231,21 +231,19 @@ def write_unit(
     Returns:
         The unit's record as stored.
     """
-    import zarr
-
-    group = zarr.open_group(folder, mode="a", zarr_format=3)
     files: dict[str, dict[str, Any]] = {}
     for name, members in group_columns(*records).items():
-        subgroup = group.create_group(name)
+        (folder / name).mkdir()
+        (folder / name / "zarr.json").write_bytes(chunks.describe_group({}))
         for path, array in _columns_of_group(name, members, samples):
             lender = next((lender for lender in lenders if path in lender.paths), None)
             if lender:
                 files |= _borrow(folder, path, lender)
             else:
-                _write_array(folder, subgroup, path, array() if callable(array) else array)
+                _write_array(folder, path, array() if callable(array) else array)
     files |= {path: fact for path, fact in _hash_all(folder).items() if path not in files}
     record = {**about, "files": dict(sorted(files.items()))}
-    group.attrs["dapdata"] = record
+    (folder / "zarr.json").write_bytes(chunks.describe_group({"dapdata": record}))
     return record
 
 
@@ -267,29 +265,17 @@ def _concatenated(column: Field[Any], samples: Sequence[Sample]) -> Array:
     return np.concatenate(parts) if is_ragged(column) else np.stack(parts)
 
 
-def _write_array(folder: Path, group: Any, path: str, array: Array) -> None:
-    """An array of a group of the unit in this folder: zarr describes it, its rows are written straight."""
-    from zarr.codecs import Crc32cCodec, ZstdCodec
-
-    about = _about(path)
+def _write_array(folder: Path, path: str, array: Array) -> None:
+    """An array of the unit in this folder, as zarr would write it."""
+    about, rows = _about(path), max(len(array), 1)
     fill = {"f": np.nan, "i": -1, "u": np.iinfo(np.uint8).max}[array.dtype.kind]
-    rows = max(len(array), 1)
     chunk = min(rows, MAX_CHUNK_ROWS)
-    group.create_array(
-        path.split("/")[1],
-        shape=array.shape,
-        dtype=array.dtype,
-        chunks=(chunk, *array.shape[1:]),
-        shards=(-(-rows // chunk) * chunk, *array.shape[1:]),
-        compressors=[ZstdCodec(level=ZSTD_LEVEL), Crc32cCodec()],
-        fill_value=fill,
-        dimension_names=_dimension_names(about),
-        attributes=_attributes(about),
-    )
+    layout = chunks.Layout(array.shape, array.dtype, chunk, -(-rows // chunk))
+    file = folder / path / layout.name
+    (file.parent if len(array) else folder / path).mkdir(parents=True)
+    described = chunks.describe(layout, fill, ZSTD_LEVEL, _attributes(about), _dimension_names(about))
+    (folder / path / "zarr.json").write_bytes(described)
     if len(array):
-        layout = chunks.Layout(array.shape, array.dtype, chunk, -(-rows // chunk))
-        file = folder / path / layout.name
-        file.parent.mkdir(parents=True, exist_ok=True)
         file.write_bytes(chunks.encode(layout, array, fill, ZSTD_LEVEL))
 
 

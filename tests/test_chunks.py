@@ -17,12 +17,16 @@ from dapdata import chunks, store
 
 def write(folder: Path, array: np.ndarray, chunk: int) -> Path:
     """An array as `store` writes it, with chunks of so many rows."""
+    path = "container/points" if array.ndim == 2 else "container/offsets"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(store, "MAX_CHUNK_ROWS", chunk)
-        group = zarr.open_group(folder, mode="w", zarr_format=3)
-        path = "container/points" if array.ndim == 2 else "container/offsets"
-        store._write_array(folder, group.create_group("container"), path, array)
+        store._write_array(folder, path, array)
     return folder / path
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    """All files by their path."""
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 def read(folder: Path) -> np.ndarray:
@@ -49,16 +53,35 @@ def test_what_is_read_is_what_zarr_reads(
     np.testing.assert_array_equal(found, zarr.open_array(folder, mode="r")[...])
 
 
-@pytest.mark.parametrize("rows", [1, 7, 20])
+@pytest.mark.parametrize("rows", [0, 1, 7, 20])
 @pytest.mark.parametrize("dtype", ["<f4", "<i8", "|u1"])
 def test_what_is_written_is_what_zarr_writes_byte_for_byte(tmp_path: Path, rows: int, dtype: str) -> None:
+    from zarr.codecs import Crc32cCodec, ZstdCodec
+
     array = np.random.default_rng(rows).integers(0, 9, (rows, 3)).astype(dtype)
-    folder = write(tmp_path, array, 7)
-    (file,) = [path for path in (folder / "c").rglob("*") if path.is_file()]
-    ours = file.read_bytes()
-    file.unlink()
-    zarr.open_array(folder, mode="r+", config={"write_empty_chunks": True})[...] = array
-    assert file.read_bytes() == ours
+    folder = write(tmp_path / "ours", array, 7)
+    chunk = min(max(rows, 1), 7)
+    theirs = zarr.open_group(tmp_path / "theirs", mode="w", zarr_format=3).create_array(
+        "points",
+        shape=array.shape,
+        dtype=array.dtype,
+        chunks=(chunk, 3),
+        shards=(-(-max(rows, 1) // chunk) * chunk, 3),
+        compressors=[ZstdCodec(level=store.ZSTD_LEVEL), Crc32cCodec()],
+        fill_value={"f": np.nan, "i": -1, "u": 255}[array.dtype.kind],
+        dimension_names=["container_point", "xyz"],
+        attributes={"unit": "m", "frame": "world", "description": "observed points"},
+        config={"write_empty_chunks": True},
+    )
+    if rows:
+        theirs[...] = array
+    assert content(folder) == content(tmp_path / "theirs/points")
+
+
+@pytest.mark.parametrize("attributes", [{}, {"dapdata": {"n": 1, "rows": [], "names": {"a": "\u00e4", "b": [0.1, None]}}}])
+def test_groups_are_described_as_zarr_does(tmp_path: Path, attributes: dict[str, object]) -> None:
+    zarr.open_group(tmp_path, mode="w", zarr_format=3, attributes=attributes)
+    assert (tmp_path / "zarr.json").read_bytes() == chunks.describe_group(attributes)
 
 
 def test_no_bit_can_flip_unseen(tmp_path: Path) -> None:

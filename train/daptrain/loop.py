@@ -311,7 +311,7 @@ def fit(
             progress.seconds = budget.spent()
             share = budget.share(progress.step)
             last = share >= 1
-            if stop is not None and stop.is_set():
+            if stop is not None and stop.is_set() and not last:
                 save_state(run, network, optimizer, average, progress)
                 return progress
             if not (progress.step % LOG_EVERY == 0 or last):
@@ -327,9 +327,10 @@ def fit(
                     save_weights(run / f"{name}.safetensors", averaged(network, average), material.task)
                 saved = -math.inf
             show(progress.step, means)
-            if time.monotonic() - saved > CHECKPOINT_SECONDS:
+            if time.monotonic() - saved > CHECKPOINT_SECONDS and not last:
                 save_state(run, network, optimizer, average, progress)
                 saved = time.monotonic()
+    # Before the state: one that has reached its budget says that these are there.
     save_weights(run / f"{name}.last.safetensors", averaged(network, average), material.task)
     progress.minutes = max(progress.minutes, budget.minutes)
     save_state(run, network, optimizer, average, progress)

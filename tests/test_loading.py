@@ -13,7 +13,7 @@ from forging import forge_manifest
 from toy_stages import toy_recipe
 
 import dapdata
-from dapdata import loading, pipeline, store
+from dapdata import loading, manifest, pipeline, store, tables
 from dapdata.errors import CorruptionError, FormatError, UsageError
 from dapdata.records import LATER, Cloud, Demo, Labels, Superpoints, read_record, to_sample
 
@@ -141,6 +141,24 @@ def refused(root: object, kind: type[Exception], split: str | None = None) -> st
 def test_folders_that_are_no_dataset_are_refused(tmp_path: Path) -> None:
     assert "no such folder" in refused(tmp_path / "nowhere", FormatError)
     assert "no manifest.json" in refused(tmp_path, FormatError)
+
+
+def test_a_dataset_that_is_labelled_anew_while_it_is_opened_is_the_new_one(
+    toy_copy: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Never the old manifest with the new index."""
+    read, todo = manifest.read_index, ["label.eps_place=0.02"]
+
+    def late(root: Path) -> tables.Index:
+        if todo:
+            pipeline.label(root, [todo.pop()], engine="inline", table="toy_stages")
+        return read(root)
+
+    before = dapdata.open(toy_copy).digest
+    monkeypatch.setattr(manifest, "read_index", late)
+    data = dapdata.open(toy_copy)
+    assert data.digest == manifest.read(toy_copy).content_sha256 != before
+    assert {*data.index["shard"]} == {shard.path for shard in data.manifest.shards}
 
 
 def test_other_formats_say_who_made_them_and_what_to_do(toy_copy: Path) -> None:

@@ -172,6 +172,33 @@ def test_what_a_kill_left_of_an_empty_dataset_is_no_reason_to_refuse_it_and_a_ru
         make_toy(in_memory / "run", 2, 2)
 
 
+def test_a_command_that_only_publishes_can_be_interrupted_at_that(in_memory: Path) -> None:
+    """All units are there, from the labelling before the last: what is left of the manifest is what the command worked on."""
+    root, gone = make_toy(in_memory / "toy", 2, 2), False
+    content = manifest.read(root).content_sha256
+
+    def stop(action: str, path: Path) -> None:
+        nonlocal gone
+        if gone:
+            raise Crash
+        gone = (action, path.name) == ("remove", manifest.MANIFEST)
+
+    pipeline.label(root, ["label.eps_place=0.02"], engine="inline", table="toy_stages")
+    with watching(stop), pytest.raises(Crash):
+        pipeline.label(root, ["label.eps_place=0.03"], engine="inline", table="toy_stages")
+    assert not (root / manifest.MANIFEST).exists()
+    pipeline.label(root, engine="inline", table="toy_stages")
+    assert manifest.read(root).content_sha256 == content
+
+
+def test_staging_is_swept_where_a_process_of_this_number_was_killed_at_that(in_memory: Path) -> None:
+    """In containers every process has the same number."""
+    for name in (f".{durable.STAGING}.{durable._here()}.tmp", durable.STAGING):
+        (in_memory / name / "unit").mkdir(parents=True)
+    durable.sweep(in_memory)
+    assert not list(in_memory.iterdir())
+
+
 # A full disk -------------------------------------------------------------------------------------------------
 
 

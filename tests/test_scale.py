@@ -176,6 +176,24 @@ def test_an_index_that_was_replaced_is_not_mixed_with_the_old_one(toy_copy: Path
         data.index["demo"]
 
 
+def test_a_table_that_unpacks_to_far_more_than_its_bytes_is_refused_before_it_does(tmp_path: Path) -> None:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    count = 2_000_000
+    bombs = {
+        "rows": pa.table({"demo": np.zeros(count, np.int64)}),
+        "columns": pa.table({f"column {i}": [i] for i in range(200)}),
+        "words": pa.table({"demo": ["a" * 5000, "b"]}),
+    }
+    for name, bomb in bombs.items():
+        pq.write_table(bomb, tmp_path / name, compression="zstd")
+        with pytest.raises(CorruptionError, match=f"{name}: cannot be read .*(rows of|words of)"):
+            tables.Index(tmp_path / name)["demo"]
+    with pytest.raises(CorruptionError, match="2000000 rows of 1 columns"):
+        tables.read(tmp_path / "rows", "demo", "0")
+
+
 def test_a_table_does_not_depend_on_how_its_rows_came(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tables, "GROUP_ROWS", 16)
     rows = [{"demo": i, "shard": f"shards/{i // 5}"} for i in range(53)]

@@ -426,6 +426,14 @@ def test_a_manifest_that_claims_what_is_not_so_is_found(name: str, golden_copy: 
     assert recalled(health.verify(golden_copy, quick=True).problems, words)
 
 
+def test_a_word_of_the_manifest_that_nothing_else_tells_is_held_to_its_digest(golden_copy: Path) -> None:
+    path = golden_copy / manifest.MANIFEST
+    tree = json.loads(path.read_text())
+    path.write_text(path.read_text().replace(f'"dapdata": "{tree["created_by"]["dapdata"]}"', '"dapdata": "9.9"'))
+    (problem,) = health.verify(golden_copy, quick=True).problems
+    assert "manifest.json: its bytes are not those that were written" in problem
+
+
 def test_units_under_each_others_keys_are_found(golden_copy: Path) -> None:
     swapped_units(golden_copy)
     assert recalled(health.verify(golden_copy, quick=True).problems, "zarr.json: key .* expected .* as in the manifest")
